@@ -1,0 +1,57 @@
+# Every target makes its own environment in .venv when it is missing or when the dependencies
+# changed, so `make quickstart` and `make test` are the only commands a fresh machine needs.
+#
+#   PYTHON=python3.12 make test                  another interpreter (3.11 is the tested one)
+#   PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu make test
+#                                                the smaller CPU build of torch
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+PIP_INSTALL := -m pip install --quiet --disable-pip-version-check -c constraints.txt
+
+# One thread per process: tests and seeds run as parallel processes, which would otherwise fight.
+export OMP_NUM_THREADS ?= 1
+export MPLBACKEND ?= Agg
+
+.PHONY: help quickstart test check build clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make quickstart   train PPO with and without symmetry on CartPole, draw the learning curves"
+	@echo "make test         run all tests and doctests"
+	@echo "make check        lint, formatting, types"
+	@echo "make build        wheel and sdist in dist/; the wheel is smoke-tested in a clean environment"
+	@echo "make clean        remove .venv, caches and build products"
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	@echo "Installing into $(VENV) (a few minutes the first time)"
+	$(BIN)/python $(PIP_INSTALL) --editable '.[dev]'
+	@touch $@
+
+quickstart: $(INSTALLED)
+	$(BIN)/python examples/quickstart.py
+
+test: $(INSTALLED)
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+check: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+build: $(INSTALLED)
+	rm -rf build dist
+	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build
+	@set -e; clean=$$(mktemp -d); trap 'rm -rf "$$clean"' EXIT; \
+	echo "Installing the wheel into a clean environment"; \
+	$(PYTHON) -m venv "$$clean/venv"; \
+	"$$clean/venv/bin/python" $(PIP_INSTALL) dist/*.whl; \
+	cp tests/smoke_wheel.py "$$clean"; cd "$$clean"; \
+	venv/bin/python -I smoke_wheel.py
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
