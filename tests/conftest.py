@@ -1,0 +1,27 @@
+"""Settings that hold for every test: one torch thread, off-screen rendering, a quiet TorchRL."""
+
+import ctypes.util
+import logging
+import os
+import sys
+
+# dm_control reads MUJOCO_GL when it is imported and refuses a value that cannot work, so EGL is
+# only asked for where it exists.
+if sys.platform == "linux" and ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+import pytest
+import torch
+import torchrl  # noqa: F401  (creates the logger that is filtered below)
+
+
+def _is_not_extension_notice(record: logging.LogRecord) -> bool:
+    return "Failed to import torchrl C++ binaries" not in record.getMessage()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "slow: takes more than about ten seconds")
+    torch.set_num_threads(1)
+    # torchrl 0.14's compiled extension was built against another torch than the pinned one. Only
+    # prioritized sampling needs it, and the tests of that say themselves why they are skipped.
+    logging.getLogger("torchrl").addFilter(_is_not_extension_notice)
