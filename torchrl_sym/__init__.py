@@ -1,0 +1,21 @@
+"""torchrl_sym: symmetry for robot reinforcement learning, as ordinary TorchRL parts."""
+
+from importlib.metadata import PackageNotFoundError, version
+
+from torchrl_sym.groups import PointGroup
+from torchrl_sym.representations import Representation
+from torchrl_sym.symmetry import Symmetry
+from torchrl_sym.transforms import SymmetryAugment, SymmetryOrbit
+
+__all__ = [
+    "PointGroup",
+    "Representation",
+    "Symmetry",
+    "SymmetryAugment",
+    "SymmetryOrbit",
+]
+
+try:
+    __version__ = version("torchrl_sym")
+except PackageNotFoundError:  # a source tree on the path, not installed
+    __version__ = "0+unknown"

@@ -1,0 +1,297 @@
+"""Symmetry of a task: which representation transforms which entry of a tensordict.
+
+For each element g the paper writes L_g for its action on states and K_g for its action on actions. A
+:class:`Symmetry` holds both as one mapping from keys to representations and applies them to whole
+tensordicts. It is strict: an entry it does not know is an error, because an observation that is silently
+left un-mirrored is the most common bug of this field.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.envs import EnvBase
+
+from torchrl_sym.groups import PointGroup
+from torchrl_sym.representations import Representation
+
+Elements = Literal["all", "random"] | Sequence[str]
+
+# Entries that TorchRL's environments, collectors, value estimators and buffers add to a batch and that
+# a symmetric copy shares with its original (Eq. sym-aug keeps log-probability, advantage and return).
+_INVARIANT = frozenset(
+    "done terminated truncated reward advantage value_target state_value value_error returns "
+    "step_count episode_reward is_init index index_generation priority_weight td_error mask traj_ids "
+    "shifted_valid sample_log_prob symmetry_id".split()
+)
+
+
+class Symmetry(nn.Module):
+    """Action of a point group on the entries of a tensordict.
+
+    Args:
+        group: the group, shared by all representations.
+        representations: how each entry's last dimension transforms, by (nested) key. ``("next", key)``
+            follows ``key``. If an action is declared, the ``loc`` and ``scale`` that a probabilistic
+            actor writes beside it follow it too (``scale`` without signs).
+        strict: raise on entries that are neither declared nor of a kind that symmetric copies share
+            (reward, done, log-probability, advantage, ... and anything under ``"collector"`` or
+            starting with ``_``). With ``False`` they are copied unchanged.
+
+    Raises:
+        TypeError: a value is not a representation.
+        ValueError: a representation belongs to another group.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_sym import PointGroup, Symmetry
+        >>> from torchrl_sym.representations import pseudoscalar
+        >>> group = PointGroup.reflection("x")
+        >>> sign = pseudoscalar(group)
+        >>> symmetry = Symmetry(group, {"observation": sign * 3, "action": sign})
+        >>> td = TensorDict(observation=torch.ones(4, 3), action=torch.ones(4, 1), batch_size=[4])
+        >>> symmetry(td, "reflect-x")["observation"][0]
+        tensor([-1., -1., -1.])
+        >>> symmetry.orbit(td).batch_size
+        torch.Size([2, 4])
+    """
+
+    def __init__(
+        self,
+        group: PointGroup,
+        representations: Mapping[NestedKey, Representation],
+        *,
+        strict: bool = True,
+    ) -> None:
+        super().__init__()
+        if not representations:
+            raise ValueError("expected at least one key with its representation, got none")
+        for key, value in representations.items():
+            if not isinstance(value, Representation):
+                raise TypeError(
+                    f"expected a Representation for {key!r}, got {type(value).__name__}; build one with "
+                    "torchrl_sym.representations, e.g. invariant(group, d)"
+                )
+            if value.group != group:
+                raise ValueError(
+                    f"the representation of {key!r} belongs to {value.group}, expected {group}; build "
+                    "it for this group or use representation.restrict(group)"
+                )
+        self.group = group
+        self.strict = strict
+        self._keys = [unravel_key(key) for key in representations]
+        self.representations = nn.ModuleList(representations.values())
+        self._table: dict[NestedKey, Representation] = dict(
+            zip(self._keys, representations.values(), strict=True)
+        )
+        self._add_distribution_parameters()
+
+    def _add_distribution_parameters(self) -> None:
+        for key in list(self._keys):
+            parent, leaf = _split(key)
+            if leaf != "action":
+                continue
+            action = self._table[key]
+            self._table.setdefault(_join(parent, "loc"), action)
+            if action.is_signed_permutation:
+                scale = action.absolute()
+                self.representations.append(scale)  # registered, so that it follows to(device)
+                self._table.setdefault(_join(parent, "scale"), scale)
+
+    def keys(self) -> list[NestedKey]:
+        """The declared keys."""
+        return list(self._keys)
+
+    def __contains__(self, key: NestedKey) -> bool:
+        return _without_next(unravel_key(key)) in self._table
+
+    def __getitem__(self, key: NestedKey) -> Representation:
+        """Representation of a key.
+
+        Raises:
+            KeyError: the key is not declared; the message lists those that are.
+        """
+        if key not in self:
+            raise KeyError(
+                f"no representation for {key!r}; this symmetry has {self._keys}. Add it to the "
+                "dictionary passed to Symmetry, e.g. invariant(group, d) if no element changes it"
+            )
+        return self._table[_without_next(unravel_key(key))]
+
+    def require(self, keys: Iterable[NestedKey], reader: str) -> None:
+        """Raise KeyError unless every key is declared; ``reader`` says who needs them."""
+        missing = [key for key in keys if key not in self]
+        if missing:
+            raise KeyError(
+                f"{reader} reads {missing}, which this symmetry does not transform (it has "
+                f"{self._keys}); add them, e.g. invariant(group, d) if no element changes them"
+            )
+
+    def elements(self, elements: Elements) -> list[int]:
+        """Indices of ``"all"`` elements, or of the identity and the named ones, originals first."""
+        if elements == "all" or elements == "random":
+            return list(range(self.group.order))
+        if isinstance(elements, str):
+            raise ValueError(
+                f"expected 'all', 'random' or a sequence of names from {list(self.group.names)}, got "
+                f"{elements!r}"
+            )
+        named = [self.group.index(e) for e in elements]
+        if not named or len(set(named)) != len(named):
+            raise ValueError(f"expected distinct element names, at least one, got {list(elements)}")
+        return [0, *(g for g in named if g != 0)]
+
+    def forward(self, tensordict: TensorDictBase, g: int | str | Tensor) -> TensorDictBase:
+        """Symmetric copy of a tensordict under one element, or one element per row.
+
+        Args:
+            tensordict: any batch; it is not modified.
+            g: element index or name, or indices of shape ``tensordict.batch_size``.
+
+        Raises:
+            KeyError: an entry that the symmetry should know but does not (strict).
+            ValueError: a tensor's last dimension differs from its representation's.
+        """
+        out = tensordict.copy()
+        for key, representation, value in self._mapped(tensordict):
+            index = g
+            if isinstance(g, Tensor):  # entries may have more batch dimensions than the tensordict
+                index = g.reshape(g.shape + (1,) * (value.ndim - 1 - g.ndim)).expand(value.shape[:-1])
+            out.set(key, representation(value, index))
+        return out
+
+    def orbit(
+        self, tensordict: TensorDictBase, elements: Sequence[int] | None = None
+    ) -> TensorDictBase:
+        """All symmetric copies: batch ``[*B]`` to ``[N, *B]``, the originals first.
+
+        Entries that copies share are expanded, not copied.
+
+        Args:
+            tensordict: any batch; it is not modified.
+            elements: indices of the elements to apply. Defaults to all of the group.
+        """
+        count = self.group.order if elements is None else len(elements)
+        out = tensordict.expand(count, *tensordict.batch_size).copy()
+        for key, representation, value in self._mapped(tensordict):
+            if elements is None:
+                images = representation.orbit(value)
+            else:
+                images = torch.stack([representation(value, g) for g in elements])
+            out.set(key, images)
+        return out
+
+    def _mapped(self, tensordict: TensorDictBase):
+        for key in tensordict.keys(include_nested=True, leaves_only=True):
+            representation = self._resolve(key)
+            if representation is not None:
+                value = tensordict.get(key)
+                if isinstance(value, Tensor):
+                    if value.ndim <= tensordict.batch_dims or value.shape[-1] != representation.dim:
+                        raise ValueError(
+                            f"entry {key!r}: expected a last dimension of {representation.dim}, got "
+                            f"shape {tuple(value.shape)} with batch size "
+                            f"{tuple(tensordict.batch_size)}; list every entry of the tensor in order"
+                        )
+                    yield key, representation, value
+
+    def _resolve(self, key: NestedKey) -> Representation | None:
+        """Representation of a batch entry, None if copies share it, KeyError if it is unknown."""
+        bare = _without_next(unravel_key(key))
+        representation = self._table.get(bare)
+        if representation is not None:
+            return representation
+        parent, leaf = _split(bare)
+        shared = (
+            leaf in _INVARIANT
+            or leaf.endswith("log_prob")
+            or leaf.startswith("_")
+            or (parent and parent[0] == "collector")
+        )
+        if self.strict and not shared:
+            raise KeyError(
+                f"the batch has {key!r}, which this symmetry does not know (it has {self._keys}); add "
+                "its representation, e.g. invariant(group, d) if no element changes it, drop it with "
+                "select=..., or pass strict=False to copy unknown entries unchanged"
+            )
+        return None
+
+    def check_specs(self, env: EnvBase) -> None:
+        """Check sizes and boxes of an environment's observations and actions.
+
+        Every element must map each bounded box onto itself. Otherwise a mirrored action leaves the
+        box: a tanh-squashed policy then assigns it a log-probability that is off by hundreds of nats.
+
+        Raises:
+            KeyError: an observation or action of the environment is not declared (strict).
+            ValueError: a size differs, or a box is not symmetric; the message names key and entry.
+        """
+        specs = Composite(shape=env.batch_size)
+        specs.update(env.observation_spec)
+        specs.update(env.full_action_spec)
+        for key, spec in specs.items(include_nested=True, leaves_only=True):
+            representation = self._resolve(key)
+            if representation is None:
+                continue
+            if not spec.shape or spec.shape[-1] != representation.dim:
+                raise ValueError(
+                    f"{key!r}: the environment has shape {tuple(spec.shape)}, expected a last dimension "
+                    f"of {representation.dim}"
+                )
+            _check_box(key, spec, representation)
+
+    def extra_repr(self) -> str:
+        return f"{self.group!r}, keys={self._keys}"
+
+
+def _check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
+    if not isinstance(spec, Bounded):
+        return
+    bounds = [
+        bound.double().cpu().expand(spec.shape).reshape(-1, representation.dim)
+        for bound in (spec.space.low, spec.space.high)
+    ]
+    matrices = representation.matrices.cpu()
+    for row in torch.cat(bounds, dim=-1).unique(dim=0):  # environments of a batch share their box
+        if row.isnan().any():
+            raise ValueError(f"{key!r}: expected a box of numbers, got NaN in its bounds")
+        row_low, row_high = row.chunk(2)
+        # image of an interval under a matrix; 0 * inf counts as 0
+        at_low = torch.where(matrices == 0, 0.0, matrices * row_low)
+        at_high = torch.where(matrices == 0, 0.0, matrices * row_high)
+        image_low = torch.minimum(at_low, at_high).sum(-1)  # (N, d)
+        image_high = torch.maximum(at_low, at_high).sum(-1)
+        wrong = ~(
+            torch.isclose(image_low, row_low, atol=1e-6)
+            & torch.isclose(image_high, row_high, atol=1e-6)
+        )
+        if wrong.any():
+            g, i = wrong.nonzero()[0].tolist()
+            raise ValueError(
+                f"{key!r}: the box of entry {i}, [{row_low[i]:g}, {row_high[i]:g}], is not mapped onto "
+                f"itself by {representation.group.names[g]!r}, whose image there is "
+                f"[{image_low[g, i]:g}, {image_high[g, i]:g}]; make the box symmetric (actions relative "
+                "to a symmetric default pose, equal limits on both sides)"
+            )
+
+
+def _without_next(key: NestedKey) -> NestedKey:
+    if isinstance(key, tuple) and key[0] == "next":
+        return unravel_key(key[1:])
+    return key
+
+
+def _split(key: NestedKey) -> tuple[tuple[str, ...], str]:
+    parts = (key,) if isinstance(key, str) else tuple(key)
+    return parts[:-1], parts[-1]
+
+
+def _join(parent: tuple[str, ...], leaf: str) -> NestedKey:
+    return unravel_key((*parent, leaf))
