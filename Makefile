@@ -44,7 +44,7 @@ check: $(INSTALLED)
 
 build: $(INSTALLED)
 	rm -rf build dist
-	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build
+	PIP_CONSTRAINT=constraints.txt $(BIN)/python -m build --quiet
 	@set -e; clean=$$(mktemp -d); trap 'rm -rf "$$clean"' EXIT; \
 	echo "Installing the wheel into a clean environment"; \
 	$(PYTHON) -m venv "$$clean/venv"; \
