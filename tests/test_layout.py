@@ -123,9 +123,7 @@ def prints(root: Path) -> list[str]:
         f"{path.relative_to(root)}:{node.lineno} prints; return, raise or log instead"
         for path in python_files(root, "torchrl_sym", "tasks")
         for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "print"
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     ]
 
 
