@@ -133,9 +133,7 @@ class PointGroup:
         return cls.generate({"turn": _turn(2 * math.pi / n), "mirror": _mirror(0.0, 1.0)})
 
     @classmethod
-    def generate(
-        cls, generators: Mapping[str, Tensor], *, fixes_vertical: bool = True
-    ) -> PointGroup:
+    def generate(cls, generators: Mapping[str, Tensor], *, fixes_vertical: bool = True) -> PointGroup:
         """The smallest group that contains the given isometries.
 
         Args:

@@ -16,6 +16,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 
 from torchrl_sym.groups import PointGroup
@@ -26,9 +27,12 @@ Elements = Literal["all", "random"] | Sequence[str]
 # Entries that TorchRL's environments, collectors, value estimators and buffers add to a batch and that
 # a symmetric copy shares with its original (Eq. sym-aug keeps log-probability, advantage and return).
 _INVARIANT = frozenset(
-    "done terminated truncated reward advantage value_target state_value value_error returns "
-    "step_count episode_reward is_init index index_generation priority_weight td_error mask traj_ids "
-    "shifted_valid sample_log_prob symmetry_id".split()
+    [
+        *("reward", "done", "terminated", "truncated", "is_init", "step_count", "episode_reward"),
+        *("advantage", "value_target", "state_value", "value_error", "returns", "td_error"),
+        *("index", "index_generation", "priority_weight", "mask", "shifted_valid", "traj_ids"),
+        *("sample_log_prob", "symmetry_id"),
+    ]
 )
 
 
@@ -167,9 +171,7 @@ class Symmetry(nn.Module):
             out.set(key, representation(value, index))
         return out
 
-    def orbit(
-        self, tensordict: TensorDictBase, elements: Sequence[int] | None = None
-    ) -> TensorDictBase:
+    def orbit(self, tensordict: TensorDictBase, elements: Sequence[int] | None = None) -> TensorDictBase:
         """All symmetric copies: batch ``[*B]`` to ``[N, *B]``, the originals first.
 
         Entries that copies share are expanded, not copied.
@@ -252,7 +254,7 @@ class Symmetry(nn.Module):
 
 
 def _check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
-    if not isinstance(spec, Bounded):
+    if not isinstance(spec, Bounded) or not isinstance(spec.space, ContinuousBox):
         return
     bounds = [
         bound.double().cpu().expand(spec.shape).reshape(-1, representation.dim)
@@ -269,8 +271,7 @@ def _check_box(key: NestedKey, spec: TensorSpec, representation: Representation)
         image_low = torch.minimum(at_low, at_high).sum(-1)  # (N, d)
         image_high = torch.maximum(at_low, at_high).sum(-1)
         wrong = ~(
-            torch.isclose(image_low, row_low, atol=1e-6)
-            & torch.isclose(image_high, row_high, atol=1e-6)
+            torch.isclose(image_low, row_low, atol=1e-6) & torch.isclose(image_high, row_high, atol=1e-6)
         )
         if wrong.any():
             g, i = wrong.nonzero()[0].tolist()
@@ -289,7 +290,7 @@ def _without_next(key: NestedKey) -> NestedKey:
 
 
 def _split(key: NestedKey) -> tuple[tuple[str, ...], str]:
-    parts = (key,) if isinstance(key, str) else tuple(key)
+    parts = (key,) if isinstance(key, str) else tuple(map(str, key))
     return parts[:-1], parts[-1]
 
 

@@ -70,7 +70,9 @@ class SymmetryAugment(Transform):
         >>> sign = pseudoscalar(group)
         >>> augment = SymmetryAugment(Symmetry(group, {"observation": sign * 3, "action": sign}))
         >>> batch = TensorDict(
-        ...     observation=torch.ones(4, 3), action=torch.ones(4, 1), advantage=torch.ones(4, 1),
+        ...     observation=torch.ones(4, 3),
+        ...     action=torch.ones(4, 1),
+        ...     advantage=torch.ones(4, 1),
         ...     batch_size=[4],
         ... )
         >>> augment(batch)["action"].flatten()
@@ -193,15 +195,14 @@ class SymmetryAugment(Transform):
 
     def _check_keys(self, td: TensorDictBase) -> None:
         present = td.keys(include_nested=True, leaves_only=True)
+        declared = self.symmetry.keys()
         missing = [
-            key
-            for key in self.symmetry.keys()
-            if key not in present and (self.select is None or key in self.select)
+            key for key in declared if key not in present and (self.select is None or key in self.select)
         ]
         if missing and self.symmetry.strict:
             raise KeyError(
-                f"the batch lacks {missing}, which the symmetry declares (it has {sorted(map(str, present))}"
-                "); rename the symmetry's key, or pass select=[...] with the keys that are there"
+                f"the batch lacks {missing}, which the symmetry declares; it has "
+                f"{sorted(map(str, present))}; rename the symmetry's key, or pass select=[...]"
             )
 
     def _check_sampling(self, caller: tuple[ReplayBuffer | None, str]) -> None:
@@ -246,7 +247,10 @@ class SymmetryOrbit(SampleUnit):
         >>> group = PointGroup.reflection("x")
         >>> orbit = SymmetryOrbit(Symmetry(group, {"observation": pseudoscalar(group)}))
         >>> buffer = TensorDictReplayBuffer(
-        ...     storage=LazyTensorStorage(8), batch_size=4, sample_unit=orbit, transform=orbit.transform()
+        ...     storage=LazyTensorStorage(8),
+        ...     batch_size=4,
+        ...     sample_unit=orbit,
+        ...     transform=orbit.transform(),
         ... )
         >>> _ = buffer.extend(TensorDict(observation=torch.ones(8, 1), batch_size=[8]))
         >>> buffer.sample()["observation"].flatten()

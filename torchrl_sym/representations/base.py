@@ -64,8 +64,9 @@ class Representation(nn.Module):
     def _initialize(self, group: PointGroup, blocks: list[Block]) -> None:
         super().__init__()
         self.group = group
-        self.blocks = nn.ModuleList(merge(blocks))
-        self._sizes = [block.dim for block in self.blocks]
+        merged = merge(blocks)
+        self._blocks = nn.ModuleList(merged)  # registered, so that they follow to(device)
+        self._sizes = [block.dim for block in merged]
         self.dim: int = sum(self._sizes)
 
     @classmethod
@@ -149,6 +150,11 @@ class Representation(nn.Module):
         return Representation.from_blocks(self.group, [*self.blocks] * times, check=False)
 
     __rmul__ = __mul__
+
+    @property
+    def blocks(self) -> list[Block]:
+        """The blocks of the direct sum, signed permutations merged with their neighbours."""
+        return list(self._blocks)  # pyright: ignore[reportReturnType]
 
     @property
     def matrices(self) -> Tensor:

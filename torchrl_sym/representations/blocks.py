@@ -8,8 +8,6 @@ to apply them; :class:`~torchrl_sym.representations.Representation` strings bloc
 
 from __future__ import annotations
 
-from typing import Union
-
 import torch
 from torch import Tensor, nn
 
@@ -61,7 +59,7 @@ class SignedPermutation(nn.Module):
         return x * sign.to(x.dtype)
 
     def product_residual(self, table: Tensor) -> Tensor:
-        """max abs entry of rho(g) rho(h) - rho(gh), for all pairs: ``(N, N)``; 0 or more than 1."""
+        """Largest entry of rho(g) rho(h) - rho(gh) for all pairs: ``(N, N)``; 0 or more than 1."""
         n, d = self.index.shape
         index = self.index[:, None].expand(n, n, d)  # rho(g) outermost
         product_index = self.index[None].expand(n, n, d).gather(-1, index)
@@ -83,7 +81,10 @@ class SignedPermutation(nn.Module):
     def absolute(self) -> SignedPermutation:
         return SignedPermutation(self.index, self.sign.abs())
 
-    def join(self, other: SignedPermutation) -> SignedPermutation:
+    def join(self, other: Block) -> SignedPermutation | None:
+        """Direct sum with the next block, None if that is of the other kind."""
+        if not isinstance(other, SignedPermutation):
+            return None
         index = torch.cat([self.index, other.index + self.dim], dim=1)
         return SignedPermutation(index, torch.cat([self.sign, other.sign], dim=1))
 
@@ -122,11 +123,16 @@ class Dense(nn.Module):
     def select(self, elements: Tensor) -> Dense:
         return Dense(self.dense[elements])
 
-    def join(self, other: Dense) -> Dense:
-        return Dense(torch.stack([torch.block_diag(a, b) for a, b in zip(self.dense, other.dense)]))
+    def join(self, other: Block) -> Dense | None:
+        """Direct sum with the next block, None if it is not dense or the sum grows too large."""
+        if not isinstance(other, Dense) or self.dim + other.dim > _DENSE_LIMIT:
+            return None
+        return Dense(
+            torch.stack([torch.block_diag(a, b) for a, b in zip(self.dense, other.dense, strict=True)])
+        )
 
 
-Block = Union[SignedPermutation, Dense]
+Block = SignedPermutation | Dense
 
 
 def block_from_matrices(matrices: Tensor) -> Block:
@@ -144,15 +150,9 @@ def merge(blocks: list[Block]) -> list[Block]:
     """Join neighbouring blocks of one kind, so that a call does as few gathers as possible."""
     merged: list[Block] = []
     for block in blocks:
-        last = merged[-1] if merged else None
-        if isinstance(block, SignedPermutation) and isinstance(last, SignedPermutation):
-            merged[-1] = last.join(block)
-        elif (
-            isinstance(block, Dense)
-            and isinstance(last, Dense)
-            and last.dim + block.dim <= _DENSE_LIMIT
-        ):
-            merged[-1] = last.join(block)
-        else:
+        joined = merged[-1].join(block) if merged else None
+        if joined is None:
             merged.append(block)
+        else:
+            merged[-1] = joined
     return merged

@@ -56,9 +56,7 @@ def rotation_6d(
     return Representation(group, _kron(_horizontal(group), other))
 
 
-def quaternion(
-    group: PointGroup, action: Action = "left", *, scalar_last: bool = False
-) -> Representation:
+def quaternion(group: PointGroup, action: Action = "left", *, scalar_last: bool = False) -> Representation:
     """A unit quaternion (w, x, y, z), as in MuJoCo.
 
     Left multiplication with the quaternion q_g of a rotation composes only up to sign: three turns of
@@ -137,16 +135,12 @@ def _to_quaternion(matrix: Tensor) -> Tensor:
 
 def _left_product(q: Tensor) -> Tensor:
     w, x, y, z = q.tolist()
-    return torch.tensor(
-        [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64
-    )
+    return torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
 
 
 def _right_product(q: Tensor) -> Tensor:
     w, x, y, z = q.tolist()
-    return torch.tensor(
-        [[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]], dtype=torch.float64
-    )
+    return torch.tensor([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]], dtype=torch.float64)
 
 
 def _eye(group: PointGroup, size: int) -> Tensor:
@@ -154,4 +148,4 @@ def _eye(group: PointGroup, size: int) -> Tensor:
 
 
 def _kron(a: Tensor, b: Tensor) -> Tensor:
-    return torch.stack([torch.kron(x.contiguous(), y.contiguous()) for x, y in zip(a, b)])
+    return torch.stack([torch.kron(x.contiguous(), y.contiguous()) for x, y in zip(a, b, strict=True)])

@@ -76,8 +76,7 @@ def permutation(
         for source, target in targets.items():
             if target.startswith("-"):
                 raise ValueError(
-                    f"{element!r} sends {source!r} to {target!r}: expected no sign; "
-                    "use signed_permutation"
+                    f"{element!r} sends {source!r} to {target!r}: expected no sign; use signed_permutation"
                 )
     return signed_permutation(group, names, maps)
 
@@ -149,9 +148,7 @@ def points(
     if (landing.sort(dim=-1).values != torch.arange(len(positions))).any():
         raise ValueError(f"expected distinct points, got two within {tolerance} m of each other")
     index = landing.argsort(dim=-1)  # entry landing[g, i] of the image comes from entry i
-    heights = Representation.from_blocks(
-        group, [SignedPermutation(index, torch.ones_like(index))]
-    )
+    heights = Representation.from_blocks(group, [SignedPermutation(index, torch.ones_like(index))])
     if value is None:
         return heights
     if value.group != group:

@@ -1,0 +1,312 @@
+"""PPO on the symmetric copies of every sample, with the original probabilities.
+
+Eq. (sym-aug) of Mittal et al.: for a sample (s, a) of the rollout policy pi_k and every element g,::
+
+    ratio_g = pi_theta(K_g[a] | L_g[s]) / pi_k(a | s)        advantage_g = A_k(s, a)
+
+The denominator and the advantage are those of the original. This is what distinguishes the rule from
+naive augmentation, whose denominator pi_k(K_g[a] | L_g[s]) can be arbitrarily small.
+"""
+
+from __future__ import annotations
+
+import contextlib
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from torch import Tensor
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.ppo import (
+    _broadcast_advantage_to_log_weight,
+    _check_advantage_broadcast,
+)
+
+from torchrl_sym.mirror_loss import batched, deterministic_action, squared_distance
+from torchrl_sym.symmetry import Elements, Symmetry
+
+
+class SymmetricClipPPOLoss(ClipPPOLoss):
+    """:class:`~torchrl.objectives.ClipPPOLoss` on the orbit of every sample.
+
+    Expands, inside the loss, only what the loss reads. Advantage estimation and normalisation see the
+    original rows; entropy, ``kl_approx``, ``clip_fraction``, ``ESS`` and the ratios are those of the
+    original rows too, so that a KL-adaptive learning rate reacts to the policy's change and not to its
+    asymmetry. The same diagnostics per element, ``(N,)``, are ``kl_approx_sym``, ``clip_fraction_sym``
+    and ``ESS_sym``.
+
+    The surrogate and the value loss are means over N * B rows: 1/N of the paper's sum over g, which
+    keeps the balance with the entropy bonus and the learning rate of plain PPO. With the trivial group
+    the loss and its gradients are those of ``ClipPPOLoss`` to the last bit.
+
+    Args:
+        actor_network: as in ``ClipPPOLoss``.
+        critic_network: as in ``ClipPPOLoss``.
+
+    Keyword Args:
+        symmetry: what transforms how; must declare everything that actor and critic read, and the action.
+        elements: ``"all"``; names of a subset (the identity is always kept); or ``"random"``: each row
+            is mapped by one uniformly drawn element, which has the same expected gradient at 1/N of the
+            cost. Diagnostics and entropy then come from the rows that drew the identity.
+        mirror_coeff: weight w of the mirror loss (Eq. symm-loss), added as ``loss_mirror``; it reuses
+            the actor's pass over the orbit. 0 leaves it out. Schedulable when positive.
+        **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts.
+
+    Raises:
+        KeyError: a network reads a key, or the action is one, that the symmetry does not declare.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torch import nn
+        >>> from torchrl.modules import IndependentNormal, ProbabilisticActor, ValueOperator
+        >>> from torchrl_sym import PointGroup, SymmetricClipPPOLoss, Symmetry
+        >>> from torchrl_sym.representations import pseudoscalar
+        >>> group = PointGroup.reflection("x")
+        >>> sign = pseudoscalar(group)
+        >>> net = nn.Sequential(nn.Linear(3, 2), NormalParamExtractor())
+        >>> actor = ProbabilisticActor(
+        ...     TensorDictModule(net, ["observation"], ["loc", "scale"]),
+        ...     in_keys=["loc", "scale"],
+        ...     distribution_class=IndependentNormal,
+        ...     return_log_prob=True,
+        ... )
+        >>> critic = ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
+        >>> loss = SymmetricClipPPOLoss(
+        ...     actor, critic, symmetry=Symmetry(group, {"observation": sign * 3, "action": sign})
+        ... )
+        >>> batch = TensorDict(
+        ...     observation=torch.randn(8, 3),
+        ...     action=torch.randn(8, 1),
+        ...     action_log_prob=torch.zeros(8),
+        ...     advantage=torch.randn(8, 1),
+        ...     value_target=torch.randn(8, 1),
+        ...     batch_size=[8],
+        ... )
+        >>> loss(batch)["kl_approx_sym"].shape
+        torch.Size([2])
+    """
+
+    mirror_coeff: Tensor
+
+    def __init__(
+        self,
+        actor_network: ProbabilisticTensorDictSequential | None = None,
+        critic_network: TensorDictModule | None = None,
+        *,
+        symmetry: Symmetry,
+        elements: Elements = "all",
+        mirror_coeff: float = 0.0,
+        **clip_ppo_kwargs,
+    ) -> None:
+        super().__init__(actor_network, critic_network, **clip_ppo_kwargs)
+        self.symmetry = symmetry
+        self.random = elements == "random"
+        self.elements = symmetry.elements(elements)
+        if mirror_coeff < 0:
+            raise ValueError(f"expected mirror_coeff >= 0, got {mirror_coeff}")
+        self._mirrors = mirror_coeff > 0
+        if self._mirrors:
+            self.register_coeff_buffer("mirror_coeff", mirror_coeff)
+        self._require_keys()
+
+    _schedulable_buffers = ClipPPOLoss._schedulable_buffers | {"mirror_coeff"}
+
+    def set_keys(self, **kwargs) -> None:
+        """Set tensordict keys, as in ``ClipPPOLoss``; new keys must be known to the symmetry."""
+        super().set_keys(**kwargs)
+        if hasattr(self, "symmetry"):  # the parent's constructor sets keys before ours runs
+            self._require_keys()
+
+    def _require_keys(self) -> None:
+        self.symmetry.require(self.actor_network.in_keys, "the actor")
+        if self.critic_network is not None:
+            self.symmetry.require(self.critic_network.in_keys, "the critic")
+        self.symmetry.require(_as_list(self.tensor_keys.action), "the surrogate objective")
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Those of ``ClipPPOLoss``, the diagnostics per element, and ``loss_mirror`` if it is on."""
+        if self._out_keys is None:
+            keys = [*super().out_keys, "kl_approx_sym", "clip_fraction_sym", "ESS_sym"]
+            self._out_keys = [*keys, "loss_mirror"] if self._mirrors else keys
+        return self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, values: list[NestedKey]) -> None:
+        self._out_keys = values
+
+    @dispatch  # pyright: ignore[reportArgumentType]
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Compute the losses; the input is not modified."""
+        td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
+        self._prepare_advantage(td)
+        td = td.select(*self._read_keys(), strict=False)
+        rows = _Rows(self, td)
+        advantage = rows.expanded.get(self.tensor_keys.advantage)
+
+        log_weight, dist, kl_approx, log_is_weight = self._log_weight(
+            rows.expanded, adv_shape=advantage.shape[:-1]
+        )
+        advantage = _broadcast_advantage_to_log_weight(advantage, log_weight)
+        _check_advantage_broadcast(advantage, log_weight)
+        # with a proximal policy or a capped ratio, the surrogate is weighted by the behaviour ratio
+        behaviour = log_weight if log_is_weight is None else log_weight + log_is_weight
+        clipped = log_weight.clamp(*self._clip_bounds)
+        gain1 = behaviour.exp() * advantage
+        gain2 = (clipped if log_is_weight is None else clipped + log_is_weight).exp() * advantage
+        gain = torch.stack([gain1, gain2], -1).min(dim=-1).values
+
+        td_out = TensorDict(loss_objective=-gain)
+        with torch.no_grad():
+            rows.report(td_out, kl_approx, (clipped != log_weight).to(gain.dtype), behaviour)
+        if self.entropy_bonus:
+            entropy = rows.originals(self._get_entropy(dist, adv_shape=advantage.shape[:-1]))
+            self._report_entropy(td_out, entropy)
+        if self._has_critic:
+            loss_critic, value_clip_fraction, explained_variance = self.loss_critic(rows.expanded)
+            td_out.set("loss_critic", loss_critic)
+            if value_clip_fraction is not None:
+                td_out.set("value_clip_fraction", value_clip_fraction)
+            if explained_variance is not None:
+                td_out.set("explained_variance", explained_variance)
+        if self._mirrors:
+            td_out.set("loss_mirror", self.mirror_coeff * self._mirror_error(rows, dist))
+        td_out = td_out.named_apply(lambda name, value: self._reduce(name, value, rows))
+        self._clear_weakrefs(
+            td,
+            td_out,
+            "actor_network_params",
+            "critic_network_params",
+            "target_actor_network_params",
+            "target_critic_network_params",
+        )
+        return td_out
+
+    def _prepare_advantage(self, td: TensorDictBase) -> None:
+        """Estimate the advantage if it is missing, and normalise it, on the original rows."""
+        advantage = td.get(self.tensor_keys.advantage, None)
+        missing = advantage is None
+        if missing:
+            if self.critic_network is None:
+                raise RuntimeError("expected an advantage in the batch, since there is no critic")
+            self.value_estimator(
+                td,
+                params=self._cached_critic_network_params_detached,
+                target_params=self.target_critic_network_params,
+            )
+            advantage = td.get(self.tensor_keys.advantage)
+        advantage = self._maybe_normalize_advantage(advantage, td, update_norm=missing)
+        td.set(self.tensor_keys.advantage, advantage)
+
+    def _read_keys(self) -> list[NestedKey]:
+        keys = self.tensor_keys
+        critic = [] if self.critic_network is None else self.critic_network.in_keys
+        read = [
+            *self.actor_network.in_keys,
+            *critic,
+            *_as_list(keys.action),
+            *self._loss_mask_keys(),
+        ]
+        read += [*_as_list(keys.sample_log_prob), keys.advantage, keys.value_target]
+        return read if self.clip_value is None else [*read, keys.value]
+
+    def _report_entropy(self, td_out: TensorDictBase, entropy: Tensor | TensorDictBase) -> None:
+        total = entropy
+        if is_tensor_collection(entropy):  # one entropy per action head
+            td_out.set("composite_entropy", entropy.detach())
+            total = entropy.sum(dim="feature", reduce=True)  # pyright: ignore[reportCallIssue]
+        td_out.set("entropy", total.detach().mean())
+        td_out.set("loss_entropy", self._weighted_loss_entropy(entropy))
+
+    def _mirror_error(self, rows: _Rows, dist: torch.distributions.Distribution) -> Tensor:
+        """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
+        act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
+        output = deterministic_action(dist)  # pi(L_g s)
+        if self.random:  # each row is one term of the sum, drawn with probability 1/N
+            with torch.no_grad():
+                label = act(deterministic_action(self._distribution(rows.td)), rows.element)
+            return len(self.elements) * squared_distance(output, label)
+        output = output.unflatten(0, (len(self.elements), -1))
+        with torch.no_grad():
+            label = torch.stack([act(output[0], g) for g in self.elements])
+        return squared_distance(output, label).sum(0)
+
+    def _distribution(self, td: TensorDictBase) -> torch.distributions.Distribution:
+        with (
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+            if self.functional
+            else contextlib.nullcontext()
+        ):
+            return self.actor_network.get_dist(td)
+
+    def _reduce(self, name: str, value: Tensor, rows: _Rows) -> Tensor:
+        if not name.startswith("loss_"):
+            return value
+        per_original = name in ("loss_entropy", "loss_mirror")
+        return self._reduce_loss(value, rows.td if per_original else rows.expanded).squeeze(-1)
+
+
+class _Rows:
+    """The rows the loss works on: all copies, group-major, or one drawn copy per row."""
+
+    def __init__(self, loss: SymmetricClipPPOLoss, td: TensorDictBase) -> None:
+        self.td = td
+        self.count = loss.symmetry.group.order if loss.random else len(loss.elements)
+        self.element: Tensor | None = None
+        if loss.random:
+            self.element = torch.randint(self.count, td.batch_size, device=td.device)
+            self.expanded = loss.symmetry(td, self.element)
+        else:
+            orbit = loss.symmetry.orbit(td, loss.elements)
+            self.expanded = orbit.reshape(-1, *td.batch_size[1:])
+
+    def originals(self, x: Tensor | TensorDictBase):
+        """Rows of the identity. With drawn elements: all rows, weighted so that the mean is theirs."""
+        if self.element is None:
+            return x[: len(x) // self.count]
+        drawn = (self.element == 0).to(torch.get_default_dtype())
+        return x * (drawn / drawn.mean().clamp_min(1 / drawn.numel())).unsqueeze(-1)
+
+    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
+        """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
+        log_ratio = log_ratio.detach().squeeze(-1)
+        own = self._own(log_ratio)
+        ess = (2 * own.logsumexp(0) - (2 * own).logsumexp(0)).exp()
+        td_out.set("clip_fraction", self.originals(clipped).mean())
+        td_out.set("kl_approx", self.originals(kl.detach()).mean())
+        td_out.set("ESS", (ess / own.isfinite().sum(0).clamp_min(1)).nan_to_num())
+        td_out.set("max_ratio", own.max().exp())
+        td_out.set("mean_ratio", self.originals(log_ratio.exp().unsqueeze(-1)).mean())
+        td_out.set("clip_fraction_sym", self._per_element(clipped.squeeze(-1)))
+        td_out.set("kl_approx_sym", self._per_element(kl.detach().squeeze(-1)))
+        td_out.set("ESS_sym", self._ess_per_element(log_ratio))
+
+    def _own(self, log_ratio: Tensor) -> Tensor:
+        if self.element is None:
+            return log_ratio[: len(log_ratio) // self.count]
+        return log_ratio.masked_fill(self.element != 0, -torch.inf)
+
+    def _membership(self, x: Tensor) -> Tensor:
+        """Which rows belong to which element, ``(N, rows)`` bool."""
+        index = torch.arange(self.count, device=x.device)
+        if self.element is None:
+            return index.repeat_interleave(x.numel() // self.count) == index[:, None]
+        return self.element.flatten() == index[:, None]
+
+    def _per_element(self, x: Tensor) -> Tensor:
+        member = self._membership(x).to(x.dtype)
+        return (member @ x.flatten()) / member.sum(1).clamp_min(1)
+
+    def _ess_per_element(self, log_ratio: Tensor) -> Tensor:
+        member = self._membership(log_ratio)
+        lw = torch.where(member, log_ratio.flatten(), -torch.inf)
+        ess = (2 * lw.logsumexp(1) - (2 * lw).logsumexp(1)).exp()
+        return (ess / member.sum(1).clamp_min(1)).nan_to_num()
+
+
+def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
+    if keys is None:
+        return []
+    return list(keys) if isinstance(keys, list) else [keys]
