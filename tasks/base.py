@@ -1,0 +1,234 @@
+"""What a task is: one description in torch, batched, from which both faces are made.
+
+A task says how a robot problem looks (observe), what is good (reward), when it is over
+(terminated), how it starts (sample_goal_state) and how its symmetry group acts on its full state
+(transform_state). It holds no simulation: every method is a function of a `State` of n rows. The
+batched TorchRL environment (environment.py) and the dm_control environment (suite.py) call the same
+methods, so that they cannot disagree.
+
+Every task file has the same anatomy: constants with meaning and unit, then one class decorated with
+`@register`, its methods in the order of the methods below.
+"""
+
+from __future__ import annotations
+
+import abc
+import difflib
+import importlib.resources
+import inspect
+from typing import Any, ClassVar, TypeVar
+
+import mujoco
+import torch
+from torch import Tensor
+
+from tasks.simulation import Simulation
+from tasks.state import Element, State
+from torchrl_sym import Symmetry
+
+_TASKS: dict[str, type[Task]] = {}
+
+T = TypeVar("T", bound="type[Task]")
+
+
+class Task(abc.ABC):
+    """Description of one robot task; subclass it, decorate the class with :func:`register`.
+
+    Class attributes a task sets: ``name``; ``asset`` (its file in tasks/assets);
+    ``control_timestep`` [s]; ``episode_seconds`` [s]; ``observation_size``; ``action_size``;
+    ``goal_names``, one per group element in the group's order; and if 1000 is not right,
+    ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged. A constructor sets
+    ``symmetry``.
+
+    The group acts on three things that must agree: observations and actions (``symmetry``) and the
+    full state (:meth:`transform_state`). Then for every element g, with L_g and K_g of the paper::
+
+        T(L_g s, K_g a) = L_g T(s, a),  r(L_g s, K_g a) = r(s, a),  observe(L_g s) = L_g observe(s)
+
+    Args:
+        episode_seconds: length of an episode, s; None for the task's own.
+
+    Example:
+        >>> from tasks.base import create
+        >>> task = create("cartpole")
+        >>> task.max_steps, task.goal_names
+        (200, ('right', 'left'))
+    """
+
+    name: ClassVar[str]
+    asset: ClassVar[str]
+    control_timestep: ClassVar[float]
+    episode_seconds: float
+    observation_size: ClassVar[int]
+    action_size: ClassVar[int]
+    goal_names: ClassVar[tuple[str, ...]]
+    max_velocity: float = 1000.0
+
+    symmetry: Symmetry
+
+    def __init__(self, *, episode_seconds: float | None = None) -> None:
+        if episode_seconds is not None:
+            self.episode_seconds = float(episode_seconds)
+        if not self.episode_seconds >= self.control_timestep:
+            raise ValueError(
+                "expected episode_seconds of at least one control step "
+                f"({self.control_timestep} s), got {self.episode_seconds}"
+            )
+        self.model = load_model(self.asset)
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.control_timestep / self.model.opt.timestep)
+
+    @property
+    def max_steps(self) -> int:
+        """Control steps after which an episode is truncated."""
+        return round(self.episode_seconds / self.control_timestep)
+
+    @abc.abstractmethod
+    def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
+        """Sample n start states of the canonical goal, the one of the identity.
+
+        The start of the equivalent goal g is ``transform_state(state, g)``: the starts of all goals
+        are paired, so that goals are compared on the same draws.
+        """
+
+    def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
+        """Sample n start states for training, by default of all goals with equal chance.
+
+        Mapping each draw by a uniformly drawn element makes the distribution exactly symmetric.
+        """
+        state = self.sample_goal_state(n, generator)
+        element = torch.randint(self.symmetry.group.order, (n,), generator=generator)
+        return self.transform_state(state, element)
+
+    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+        """Start states for rows whose episode is over; a curriculum judges ``finished`` here.
+
+        Args:
+            finished: the last state of these rows; ``finished.steps`` is 0 where no step was made.
+            generator: the environment's generator; draw from nothing else.
+        """
+        return self.sample_initial_state(len(finished), generator)
+
+    def randomize(  # noqa: B027  (optional, so not abstract)
+        self, simulation: Simulation, ids: Tensor, generator: torch.Generator | None
+    ) -> None:
+        """Randomise the physics of rows about to start (``Simulation.expand``); off by default.
+
+        Draw values whose distribution the group maps onto itself, or the task stops being
+        symmetric.
+        """
+
+    @abc.abstractmethod
+    def control(self, action: Tensor, state: State) -> Tensor:
+        """Actuator controls for actions: ``(n, action_size)`` in [-1, 1] to ``(n, nu)``.
+
+        NaN must pass through, so that the simulation can report it.
+        """
+
+    def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Task variables after a step (last action, ...), by name; those not returned stay.
+
+        Called after the reward and before the observation: the reward sees the variables from
+        before the step.
+        """
+        return {}
+
+    @abc.abstractmethod
+    def observe(self, state: State) -> Tensor:
+        """Observation, a new tensor of shape ``(n, observation_size)``."""
+
+    @abc.abstractmethod
+    def reward(self, state: State, action: Tensor) -> Tensor:
+        """Reward of the step that led to ``state`` by ``action``, ``(n,)``."""
+
+    def terminated(self, state: State) -> Tensor:
+        """Whether the episode ends here with no future value, ``(n,)`` bool; never by default."""
+        return torch.zeros(len(state), dtype=torch.bool)
+
+    @abc.abstractmethod
+    def transform_state(self, state: State, g: Element) -> State:
+        """L_g on the full state, task variables included; a new state.
+
+        Args:
+            state: n rows.
+            g: an element by index or name, or one index per row, ``(n,)``.
+        """
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the task learned itself during training (a curriculum phase); empty by default."""
+        return {}
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:  # noqa: B027
+        """Continue from :meth:`state_dict`."""
+
+
+def load_model(asset: str) -> mujoco.MjModel:  # pyright: ignore[reportAttributeAccessIssue]
+    """Compile an MJCF file of tasks/assets; its includes are found there too.
+
+    Args:
+        asset: file name, such as ``"cartpole.xml"``.
+
+    Example:
+        >>> load_model("cartpole.xml").nu
+        1
+    """
+    folder = importlib.resources.files("tasks") / "assets"
+    files = {f.name: f.read_bytes() for f in folder.iterdir() if f.name.endswith(".xml")}
+    if asset not in files:
+        raise FileNotFoundError(
+            f"expected {asset!r} among the files of tasks/assets, got {sorted(files)}; "
+            "a missing file there means that the package was installed without its data"
+        )
+    text = files.pop(asset).decode()
+    return mujoco.MjModel.from_xml_string(text, files)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def register(cls: T) -> T:
+    """Class decorator that makes a task known under its ``name``.
+
+    Raises:
+        ValueError: the name is taken.
+    """
+    if cls.name in _TASKS:
+        raise ValueError(
+            f"expected a new task name, got {cls.name!r}, which "
+            f"{_TASKS[cls.name].__qualname__} has; rename one of the two"
+        )
+    _TASKS[cls.name] = cls
+    return cls
+
+
+def registered() -> tuple[str, ...]:
+    """Names of all tasks, in the order of their definition."""
+    return tuple(_TASKS)
+
+
+def create(name: str, **task_kwargs: Any) -> Task:
+    """The description of a task by name.
+
+    Args:
+        name: one of ``tasks.ALL_TASKS``.
+        **task_kwargs: keyword arguments of the task's class.
+
+    Raises:
+        KeyError: no such task; the message lists the names.
+        TypeError: an argument that this task does not take; the message lists the ones it takes.
+
+    Example:
+        >>> create("cartpole", episode_seconds=2.0).max_steps
+        100
+    """
+    if name not in _TASKS:
+        close = difflib.get_close_matches(str(name), _TASKS, n=1)
+        hint = f"; did you mean {close[0]!r}?" if close else "; see tasks.ALL_TASKS"
+        raise KeyError(f"expected one of the tasks {list(_TASKS)}, got {name!r}{hint}")
+    accepted = list(inspect.signature(_TASKS[name]).parameters)
+    unknown = [key for key in task_kwargs if key not in accepted]
+    if unknown:
+        raise TypeError(
+            f"expected task arguments of {name!r} among {accepted}, got {unknown}; remove or rename them"
+        )
+    return _TASKS[name](**task_kwargs)

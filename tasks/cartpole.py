@@ -1,0 +1,109 @@
+"""CartPole swing-up: the smallest task on which a symmetric policy is worth something.
+
+A cart on an endless rail carries a pole that starts lying flat, to the right or to the left, and
+has to be swung up and held. Mirroring left and right (x -> -x) maps one start onto the other, so
+both are equally hard; plain PPO nevertheless often learns one side only. The paper's Table I
+measures this by the difference between the returns of the two starts.
+
+The angle is wrapped by theta - 2 pi round(theta / 2 pi), which is an odd function in floating-point
+arithmetic too: wrapping commutes with the reflection exactly. The price is the closed interval
+[-pi, pi] instead of the paper's half-open one, which no reflection can preserve: a pole hanging at
+exactly theta = pi keeps its sign, and its mirror image is observed at -pi. That state has
+probability zero.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from tasks.base import Task, register
+from tasks.state import Element, State
+from torchrl_sym import PointGroup, Symmetry
+from torchrl_sym.representations import pseudoscalar
+
+# Desired cart velocity at full action, m/s. The paper gives no limit.
+MAX_CART_VELOCITY = 3.0
+# Scales of the observation (cart velocity m/s, pole angle rad, pole velocity rad/s): about 1 each.
+OBSERVATION_SCALE = (3.0, math.pi, 10.0)
+# The pole starts flat: angle from upright, rad.
+START_ANGLE = math.pi / 2
+# Half-width of the uniform noise on the start angle (rad) and on both velocities (m/s, rad/s).
+START_NOISE = 0.1
+
+
+@register
+class CartPole(Task):
+    """Swing up a pole that starts flat on either side, by commanding the cart's velocity.
+
+    State: cart position x [m] and pole angle theta [rad] from upright, positive to the right (+x).
+    Group: C2, the reflection x -> -x, which flips the sign of everything. Reward per step:
+    ``-|theta| dt``, the L1 distance from upright integrated over time [rad s].
+
+    Args:
+        episode_seconds: length of an episode, s; None for 4 s.
+
+    Example:
+        >>> import torch
+        >>> task = CartPole()
+        >>> start = task.sample_goal_state(2, torch.Generator().manual_seed(0))
+        >>> mirrored = task.transform_state(start, "reflect-x")
+        >>> bool((task.observe(mirrored) == -task.observe(start)).all())
+        True
+    """
+
+    name = "cartpole"
+    asset = "cartpole.xml"
+    control_timestep = 0.02
+    episode_seconds = 4.0
+    observation_size = 3
+    action_size = 1
+    goal_names = ("right", "left")
+
+    def __init__(self, *, episode_seconds: float | None = None) -> None:
+        super().__init__(episode_seconds=episode_seconds)
+        group = PointGroup.reflection("x")
+        # Sliding along x and turning about y: one sign for both coordinates and all made of them.
+        self._coordinates = pseudoscalar(group) * 2
+        self.symmetry = Symmetry(
+            group, {"observation": pseudoscalar(group) * 3, "action": pseudoscalar(group)}
+        )
+        self._scale = torch.tensor(OBSERVATION_SCALE, dtype=torch.float64)
+
+    def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
+        """The pole lies flat to the right; noise on its angle and on both velocities."""
+        noise = torch.rand(n, 3, generator=generator, dtype=torch.float64) * 2 - 1
+        noise *= START_NOISE
+        qpos = torch.zeros(n, 2, dtype=torch.float64)
+        qpos[:, 1] = START_ANGLE + noise[:, 0]
+        return State(qpos=qpos, qvel=noise[:, 1:])
+
+    def control(self, action: Tensor, state: State) -> Tensor:
+        """Desired cart velocity, m/s."""
+        return action.clamp(-1.0, 1.0) * MAX_CART_VELOCITY
+
+    def observe(self, state: State) -> Tensor:
+        """Cart velocity, pole angle and pole velocity, each over its scale.
+
+        The cart's position is left out: the rail has no end, so nothing depends on it.
+        """
+        cart_velocity, pole_velocity = state.qvel.unbind(-1)
+        pole = torch.stack([cart_velocity, _angle(state), pole_velocity], dim=-1)
+        return pole.div_(self._scale)
+
+    def reward(self, state: State, action: Tensor) -> Tensor:
+        """Minus the pole's distance from upright, over the time of the step, rad s."""
+        return -_angle(state).abs() * self.control_timestep
+
+    def transform_state(self, state: State, g: Element) -> State:
+        """Mirror cart and pole."""
+        flip = self._coordinates
+        return State(flip(state.qpos, g), flip(state.qvel, g), steps=state.steps.clone())
+
+
+def _angle(state: State) -> Tensor:
+    """Pole angle from upright, in [-pi, pi], rad; odd in floating-point arithmetic (see above)."""
+    angle = state.qpos[:, 1]
+    return angle - (angle * (0.5 / math.pi)).round_() * (2 * math.pi)

@@ -1,0 +1,290 @@
+"""The batched TorchRL face of a task: n simulations as one environment.
+
+`BatchedEnv` ties a task's description to a `Simulation` and meets TorchRL's contract for batched
+environments: it never resets itself (the true last observation of an episode is under "next", so
+that time-outs can be bootstrapped), resets any subset of rows, and can be saved and continued bit
+for bit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from tasks.base import Task, create
+from tasks.simulation import Simulation
+from tasks.state import State
+
+
+class BatchedEnv(EnvBase):
+    """n simulations of one task as a TorchRL environment of batch size ``[n]``.
+
+    Keys: ``"observation"`` (n, observation_size) float32; ``"action"`` (n, action_size) float32 in
+    [-1, 1], clipped; ``"reward"``, ``"done"``, ``"terminated"``, ``"truncated"`` (n, 1). An episode
+    is truncated after ``task.max_steps`` steps and terminated where the task says so.
+
+    A row whose simulation diverges, or whose action is not finite, is terminated with reward 0 and
+    counted in ``num_diverged``; its observation is that of the model's reference configuration. The
+    other rows are not affected.
+
+    Args:
+        task: the description.
+        num_envs: number of simulations n.
+        num_threads: physics threads, 0 for all cores; does not change the results.
+        seed: seed of all start states. Defaults to a draw from torch's global generator.
+        device: where tensors go; the physics runs on the CPU. Defaults to the CPU.
+
+    Attributes:
+        task: the description.
+        symmetry: the task's :class:`~torchrl_sym.Symmetry`.
+        simulation: the physics.
+        num_diverged: simulations that diverged since construction.
+
+    Example:
+        >>> from tasks.base import create
+        >>> env = BatchedEnv(create("cartpole"), num_envs=4, num_threads=1, seed=0)
+        >>> env.rollout(10)["next", "observation"].shape
+        torch.Size([4, 10, 3])
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        num_envs: int,
+        *,
+        num_threads: int = 2,
+        seed: int | None = None,
+        device: torch.device | str | None = None,
+    ) -> None:
+        simulation = Simulation(task.model, num_envs, num_threads, max_velocity=task.max_velocity)
+        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        self.task = task
+        self.simulation = simulation
+        self.num_diverged = 0
+        self._generator = torch.Generator()
+        self._make_specs()
+        self._max_steps = task.max_steps
+        self._substeps = task.substeps
+        # The state of all rows; its positions and velocities are the simulation's own memory.
+        self._state = State(simulation.qpos, simulation.qvel, simulation.mocap_pos, simulation.mocap_quat)
+        self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
+        self._started = False
+        self._restored = False
+        self.set_seed(seed if seed is not None else int(torch.randint(2**31, ())))
+
+    @property
+    def symmetry(self):
+        """How the task's group acts on observation and action."""
+        return self.task.symmetry
+
+    @property
+    def state(self) -> State:
+        """A copy of the full state of all rows."""
+        return self._state.clone()
+
+    def _make_specs(self) -> None:
+        (n,) = self.batch_size
+        task = self.task
+
+        real: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
+
+        def flag() -> Binary:
+            return Binary(1, shape=torch.Size((n, 1)), dtype=torch.bool, device=self.device)
+
+        self.observation_spec = Composite(
+            observation=Unbounded(torch.Size((n, task.observation_size)), **real), shape=(n,)
+        )
+        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((n, task.action_size)), **real)
+        self.reward_spec = Unbounded(torch.Size((n, 1)), **real)
+        self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            self._generator.seed()
+        else:
+            self._generator.manual_seed(seed)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._restored = False
+        task, state, simulation = self.task, self._state, self.simulation
+        action = tensordict.get("action").detach().cpu()
+        active = tensordict.get("_step", None)  # TorchRL skips rows that are done in some rollouts
+        if active is None:
+            simulation.step(task.control(action, state), self._substeps)
+            state.steps += 1
+        else:
+            active = active.reshape(-1).cpu()
+            simulation.step(task.control(action, state), self._substeps, active)
+            state.steps += active
+        diverged = simulation.diverged()
+        some_diverged = bool(diverged.any())
+        if some_diverged:
+            self.num_diverged += int(diverged.sum())
+            action = action.masked_fill(diverged[:, None], 0.0)
+        reward = task.reward(state, action)
+        for name, value in task.update(state, action).items():
+            state.variables[name].copy_(value)
+        terminated = task.terminated(state)
+        if some_diverged:
+            reward = reward.masked_fill(diverged, 0.0)
+            terminated = terminated | diverged
+        truncated = state.steps >= self._max_steps
+        self._over = terminated | truncated
+        return self._output(
+            observation=task.observe(state).to(torch.float32),
+            reward=reward.to(torch.float32)[:, None],
+            done=self._over[:, None].clone(),
+            terminated=terminated[:, None],
+            truncated=truncated[:, None],
+        )
+
+    def _output(self, **entries: Tensor) -> TensorDict:
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        rows = torch.ones_like(self._over) if mask is None else mask.reshape(-1).cpu()
+        if self._restored and bool(rows.all()):
+            rows = self._over  # continue: only episodes that had ended when saved begin anew
+        self._restored = False
+        ids = rows.nonzero().squeeze(-1)
+        if len(ids):
+            if self._started:
+                start = self.task.restart(self._state.rows(ids), self._generator)
+            else:
+                start = self.task.sample_initial_state(len(ids), self._generator)
+            self._write(ids, start)
+            self.task.randomize(self.simulation, ids, self._generator)
+        return self._first_output()
+
+    def reset_to(self, state: State) -> TensorDict:
+        """Start an episode of every row from a given state, as for evaluation.
+
+        Args:
+            state: n rows; ``state.steps`` counts towards the step limit.
+
+        Returns:
+            What :meth:`reset` returns.
+
+        Raises:
+            ValueError: a wrong number of rows, or a state that is not finite.
+
+        Example:
+            >>> import tasks, torch
+            >>> env = tasks.make_env("cartpole", num_envs=2, num_threads=1)
+            >>> start = env.task.sample_goal_state(2, torch.Generator().manual_seed(0))
+            >>> left = env.reset_to(env.task.transform_state(start, "reflect-x"))
+            >>> bool((left["observation"] == -env.reset_to(start)["observation"]).all())
+            True
+        """
+        if len(state) != self.batch_size[0]:
+            raise ValueError(
+                f"expected a state of {self.batch_size[0]} rows, one per simulation, got {len(state)}"
+            )
+        self._restored = False
+        self._write(torch.arange(len(state)), state)
+        return self._first_output()
+
+    def _write(self, ids: Tensor, start: State) -> None:
+        self.simulation.write(ids, start.qpos, start.qvel, start.mocap_pos, start.mocap_quat)
+        if not self._started:  # the first full reset says which variables the task has
+            self._state.variables = {name: x.clone() for name, x in start.variables.items()}
+            self._started = True
+        self._state.steps[ids] = start.steps
+        for name, value in start.variables.items():
+            self._state.variables[name][ids] = value
+        self._over[ids] = False
+
+    def _first_output(self) -> TensorDict:
+        flags = torch.zeros(3, *self.batch_size, 1, dtype=torch.bool)
+        return self._output(
+            observation=self.task.observe(self._state).to(torch.float32),
+            done=flags[0],
+            terminated=flags[1],
+            truncated=flags[2],
+        )
+
+    def save_state(self) -> dict[str, Any]:
+        """Everything that decides the future of this environment, as copied tensors.
+
+        Physics rows, episode steps, task variables, random generator and curriculum. The dictionary
+        can be stored with ``torch.save`` and read with ``weights_only=True``.
+        """
+        return {
+            "simulation": self.simulation.save(),
+            "steps": self._state.steps.clone(),
+            "variables": {name: x.clone() for name, x in self._state.variables.items()},
+            "over": self._over.clone(),
+            "started": self._started,
+            "generator": self._generator.get_state(),
+            "num_diverged": self.num_diverged,
+            "task": self.task.state_dict(),
+        }
+
+    def restore_state(self, saved: dict[str, Any]) -> None:
+        """Continue exactly where :meth:`save_state` was called.
+
+        The next full ``reset()`` returns the observation of the restored state instead of drawing
+        new starts (rows whose episode had just ended begin anew, as they would have): a collector,
+        which begins by a reset, therefore continues the interrupted episodes. Later resets are
+        ordinary.
+
+        Raises:
+            ValueError: the state belongs to another task or number of simulations.
+
+        Example:
+            >>> import tasks
+            >>> env = tasks.make_env("cartpole", num_envs=2, num_threads=1, seed=0)
+            >>> last = env.rollout(5)["next", "observation"][:, -1]
+            >>> other = tasks.make_env("cartpole", num_envs=2, num_threads=1, seed=1)
+            >>> other.restore_state(env.save_state())
+            >>> bool((other.reset()["observation"] == last).all())
+            True
+        """
+        self.simulation.load(saved["simulation"])
+        self._state.steps.copy_(saved["steps"])
+        self._state.variables = {name: x.clone() for name, x in saved["variables"].items()}
+        self._over = saved["over"].clone()
+        self._started = saved["started"]
+        self._generator.set_state(saved["generator"])
+        self.num_diverged = saved["num_diverged"]
+        self.task.load_state_dict(saved["task"])
+        self._restored = self._started
+
+
+def make_env(
+    name: str,
+    *,
+    num_envs: int = 64,
+    num_threads: int = 2,
+    seed: int | None = None,
+    device: torch.device | str | None = None,
+    **task_kwargs: Any,
+) -> BatchedEnv:
+    """Batched TorchRL environment of a task, by name.
+
+    Args:
+        name: one of ``tasks.ALL_TASKS``.
+        num_envs: number of simulations.
+        num_threads: physics threads, 0 for all cores; does not change the results.
+        seed: seed of all start states. Defaults to a draw from torch's global generator.
+        device: where tensors go; the physics runs on the CPU. Defaults to the CPU.
+        **task_kwargs: arguments of the task, such as ``episode_seconds``.
+
+    Raises:
+        KeyError: no such task; the message lists the names.
+        TypeError: an argument that the task does not take.
+
+    Example:
+        >>> import tasks
+        >>> env = tasks.make_env("cartpole", num_envs=16, num_threads=1, seed=0)
+        >>> env.reset()["observation"].shape
+        torch.Size([16, 3])
+    """
+    task = create(name, **task_kwargs)
+    return BatchedEnv(task, num_envs, num_threads=num_threads, seed=seed, device=device)

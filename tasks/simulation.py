@@ -1,0 +1,225 @@
+"""Batched physics behind a small interface.
+
+`Simulation` runs n copies of one MuJoCo model on a pool of C++ threads (`mujoco.batch`): set the
+controls, step, read the state through live tensors, write rows. It knows nothing of tasks, rewards
+or TorchRL, and an engine on another device (mujoco-warp) needs to offer no more than its public
+methods.
+
+Two rules make it safe to learn on. A simulation that diverges is reported once, by `diverged`, and
+put back at the model's reference configuration at rest, so that no later read sees NaN. And results
+do not depend on the number of threads, so that a seed reproduces a run on any machine.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import torch
+from mujoco.batch import Batch, SimulationError
+from torch import Tensor
+
+
+class Simulation:
+    """n simulations of one MuJoCo model, stepped on a thread pool.
+
+    The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``mocap_pos`` (n, nmocap,
+    3) and ``mocap_quat`` (n, nmocap, 4) are live float64 views of the simulations' memory in
+    MuJoCo's units (m, rad, s, N): they change with every step, so copy what you keep. Start
+    episodes with :meth:`write`, not through the views: it also clears what the solver remembers.
+
+    Args:
+        model: the compiled model; shared by all simulations.
+        num_envs: number of simulations n.
+        num_threads: physics threads, 0 for all cores. Does not change the results.
+        max_velocity: a row with an entry of ``|qvel|`` above this (m/s or rad/s) counts as
+            diverged, well before MuJoCo's own limit of 1e10.
+
+    Raises:
+        ValueError: a size that is not positive.
+
+    Example:
+        >>> import mujoco, torch
+        >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody><body>
+        ...   <joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>''')
+        >>> simulation = Simulation(model, num_envs=3, num_threads=1)
+        >>> simulation.step(torch.zeros(3, 0), substeps=10)
+        >>> simulation.qpos.shape, bool((simulation.qvel < 0).all())
+        (torch.Size([3, 1]), True)
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,  # pyright: ignore[reportAttributeAccessIssue]
+        num_envs: int,
+        num_threads: int = 2,
+        *,
+        max_velocity: float = 1000.0,
+    ) -> None:
+        if num_envs < 1 or num_threads < 0 or not max_velocity > 0:
+            raise ValueError(
+                "expected num_envs >= 1, num_threads >= 0 (0 for all cores) and max_velocity > 0, "
+                f"got {num_envs}, {num_threads} and {max_velocity}"
+            )
+        self.model = model
+        self.num_envs = num_envs
+        self.max_velocity = max_velocity
+        self._batch = Batch(model, num_envs, num_threads)
+        self._state = torch.from_numpy(self._batch.state)
+        self.qpos = self._view("qpos")
+        self.qvel = self._view("qvel")
+        self.ctrl = self._view("ctrl")
+        self.mocap_pos = self._view("mocap_pos")
+        self.mocap_quat = self._view("mocap_quat")
+        self._warnings = self._batch.warning  # (n, kinds, 2) counters, live
+        self._reference = self._state[0].clone()
+        self._none_diverged = torch.zeros(num_envs, dtype=torch.bool)
+        self._diverged = self._none_diverged
+        self._expanded: dict[str, Tensor] = {}
+
+    def _view(self, name: str) -> Tensor:
+        return torch.from_numpy(self._batch.bind(name))
+
+    def step(self, ctrl: Tensor, substeps: int = 1, ids: Tensor | None = None) -> None:
+        """Advance by ``substeps`` timesteps of the model with constant controls.
+
+        A row whose control is not finite is stepped with zero control and reported as diverged.
+
+        Args:
+            ctrl: ``(n, nu)`` in the units of the model's actuators.
+            substeps: physics steps per call.
+            ids: step only these rows (numbers in increasing order, or a mask); the others stay as
+                they are.
+        """
+        self.ctrl.copy_(ctrl)
+        diverged = self._none_diverged
+        if not math.isfinite(float(self.ctrl.sum())):
+            diverged = ~self.ctrl.isfinite().all(dim=-1)
+            self.ctrl[diverged] = 0.0
+        try:
+            self._batch.step(None if ids is None else ids.numpy(), nstep=substeps)
+        except SimulationError as error:  # only the rows in error.ids failed
+            diverged = diverged.clone()
+            diverged[torch.as_tensor(error.ids, dtype=torch.int64)] = True
+        self._diverged = diverged | self._lost() if self._any_lost() else diverged
+        if self._diverged is not self._none_diverged:
+            self._park(self._diverged)
+
+    def _any_lost(self) -> bool:
+        """Whether any row may have diverged: three reductions, the only price of a healthy step."""
+        # Maxima propagate NaN, which fails both comparisons; on strided rows they beat sums by far.
+        fastest, farthest = (float(x.abs().amax()) for x in (self.qvel, self.qpos))
+        healthy = fastest <= self.max_velocity and farthest < math.inf
+        return not healthy or bool(self._warnings.any())
+
+    def _lost(self) -> Tensor:
+        too_fast = ~(self.qvel.abs() <= self.max_velocity).all(dim=-1)
+        warned = torch.from_numpy(self._warnings[:, :, 1].any(axis=-1))
+        return too_fast | ~self.qpos.isfinite().all(dim=-1) | warned
+
+    def _park(self, rows: Tensor) -> None:
+        self._warnings[rows.numpy()] = 0
+        self._state[rows] = self._reference
+
+    def diverged(self) -> Tensor:
+        """Rows that diverged in the last :meth:`step`, ``(n,)`` bool; do not write into it.
+
+        A row diverges when its control or its state stops being finite, when it moves faster than
+        ``max_velocity``, or when MuJoCo warns about it or fails on it. It then stands at the
+        model's reference configuration, at rest, and can be stepped or written again.
+
+        Example:
+            >>> import mujoco, torch
+            >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody><body>
+            ...     <joint type="slide" axis="0 0 1"/><geom size=".1"/>
+            ...   </body></worldbody></mujoco>''')
+            >>> simulation = Simulation(model, num_envs=2, num_threads=1, max_velocity=100.0)
+            >>> simulation.qvel[1] = 1e6
+            >>> simulation.step(torch.zeros(2, 0))
+            >>> simulation.diverged()
+            tensor([False,  True])
+        """
+        return self._diverged
+
+    def write(
+        self,
+        ids: Tensor | None,
+        qpos: Tensor,
+        qvel: Tensor,
+        mocap_pos: Tensor | None = None,
+        mocap_quat: Tensor | None = None,
+    ) -> None:
+        """Start rows afresh: all that is not given returns to the model's defaults.
+
+        That includes the time, the controls, the actuator states and the solver's warm start, which
+        would otherwise carry the previous episode into the next one.
+
+        Args:
+            ids: the rows, as numbers or a mask of n; None for all. k rows are written.
+            qpos: ``(k, nq)``.
+            qvel: ``(k, nv)``.
+            mocap_pos: ``(k, nmocap, 3)``, or None for the model's.
+            mocap_quat: ``(k, nmocap, 4)``, or None for the model's.
+
+        Raises:
+            ValueError: a value that is not finite, or a wrong shape.
+        """
+        rows = slice(None) if ids is None else ids
+        k = len(self._none_diverged[rows])
+        fields = {"qpos": qpos, "qvel": qvel, "mocap_pos": mocap_pos, "mocap_quat": mocap_quat}
+        given = {name: value for name, value in fields.items() if value is not None}
+        for name, value in given.items():
+            expected = (k, *getattr(self, name).shape[1:])
+            if tuple(value.shape) != expected or not bool(value.isfinite().all()):
+                raise ValueError(
+                    f"expected finite {name} of shape {expected}, got shape {tuple(value.shape)} "
+                    f"with {int((~value.isfinite()).sum())} entries that are not finite; check "
+                    "how the start states are sampled"
+                )
+        self._state[rows] = self._reference
+        for name, value in given.items():
+            getattr(self, name)[rows] = value.to(torch.float64)
+
+    def expand(self, name: str) -> Tensor:
+        """Give a model field its own value per simulation (domain randomisation).
+
+        Args:
+            name: an ``MjModel`` field such as ``"body_mass"``, ``"geom_friction"``.
+
+        Returns:
+            The live ``(n, ...)`` values, to be written in place. Call :meth:`refresh` after writing
+            masses, inertias or anything else that MuJoCo derives constants from.
+        """
+        if name not in self._expanded:
+            self._expanded[name] = torch.from_numpy(self._batch.expand(name))
+        return self._expanded[name]
+
+    def refresh(self, ids: Tensor | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from expanded fields (``mj_setConst``)."""
+        self._batch.set_const(None if ids is None else ids.numpy())
+
+    def save(self) -> dict[str, Tensor]:
+        """Everything that decides the future, copied: state rows, per-simulation model fields."""
+        expanded = {f"model.{name}": x.clone() for name, x in self._expanded.items()}
+        return {"rows": self._state.clone(), **expanded}
+
+    def load(self, saved: dict[str, Tensor]) -> None:
+        """Continue from :meth:`save`, bit for bit.
+
+        Raises:
+            ValueError: the state belongs to another model or another number of simulations.
+        """
+        if saved["rows"].shape != self._state.shape:
+            raise ValueError(
+                f"expected saved rows of shape {tuple(self._state.shape)} (num_envs, state size), "
+                f"got {tuple(saved['rows'].shape)}; build the simulation with the model and the "
+                "number of simulations it was saved with"
+            )
+        self._state.copy_(saved["rows"])
+        names = [key.removeprefix("model.") for key in saved if key.startswith("model.")]
+        for name in names:
+            self.expand(name).copy_(saved[f"model.{name}"])
+        if names:
+            self.refresh()
+        self._warnings[:] = 0
+        self._diverged = self._none_diverged

@@ -1,0 +1,95 @@
+"""The state of a batch of simulations, as a task sees it.
+
+Everything a task computes - observation, reward, termination - is a function of one `State`: what
+the physics holds (positions, velocities, mocap bodies), how many control steps the episode has
+lasted, and the task's own variables (a target, the last action, a curriculum level). The row index
+is the simulation: every tensor has shape (n, ...).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+Element = int | str | Tensor
+"""A group element: its index, its name, or one index per row, ``(n,)``."""
+
+
+@dataclass
+class State:
+    """Full state of n simulations, everything in SI units.
+
+    Attributes:
+        qpos: generalised positions, ``(n, nq)`` float64, m and rad (quaternions w, x, y, z).
+        qvel: generalised velocities, ``(n, nv)`` float64, m/s and rad/s.
+        mocap_pos: positions of the mocap bodies, ``(n, nmocap, 3)``, m; None: as in the model.
+        mocap_quat: their orientations, ``(n, nmocap, 4)``; None: as in the model.
+        steps: control steps since the start of the episode, ``(n,)`` int64; zero when left out.
+        variables: the task's own tensors by name, ``(n, ...)`` each.
+
+    Example:
+        >>> import torch
+        >>> state = State(torch.zeros(3, 2), torch.ones(3, 2), variables={"target": torch.eye(3)})
+        >>> state.rows(torch.tensor([2])).variables["target"]
+        tensor([[0., 0., 1.]])
+    """
+
+    qpos: Tensor
+    qvel: Tensor
+    mocap_pos: Tensor | None = None
+    mocap_quat: Tensor | None = None
+    steps: Tensor = None  # type: ignore[assignment]  # filled in __post_init__
+    variables: dict[str, Tensor] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.steps is None:
+            self.steps = torch.zeros(len(self.qpos), dtype=torch.int64)
+
+    def __len__(self) -> int:
+        return len(self.qpos)
+
+    def rows(self, ids: Tensor | slice) -> State:
+        """A copy of some rows; ``ids`` is a slice, row numbers or a boolean mask."""
+        return self._map(lambda x: x[ids].clone())
+
+    def clone(self) -> State:
+        """A copy that shares no memory with the simulation."""
+        return self._map(Tensor.clone)
+
+    def _map(self, function: Callable[[Tensor], Tensor]) -> State:
+        return State(
+            qpos=function(self.qpos),
+            qvel=function(self.qvel),
+            mocap_pos=None if self.mocap_pos is None else function(self.mocap_pos),
+            mocap_quat=None if self.mocap_quat is None else function(self.mocap_quat),
+            steps=function(self.steps),
+            variables={name: function(x) for name, x in self.variables.items()},
+        )
+
+
+def concatenate(states: list[State]) -> State:
+    """The rows of several states of one task, one after the other.
+
+    Example:
+        >>> import torch
+        >>> one = State(torch.zeros(1, 2), torch.zeros(1, 2))
+        >>> len(concatenate([one, one, one]))
+        3
+    """
+
+    def join(parts: list[Tensor | None]) -> Tensor | None:
+        given = [part for part in parts if part is not None]
+        return torch.cat(given) if given else None
+
+    first = states[0]
+    return State(
+        qpos=torch.cat([s.qpos for s in states]),
+        qvel=torch.cat([s.qvel for s in states]),
+        mocap_pos=join([s.mocap_pos for s in states]),
+        mocap_quat=join([s.mocap_quat for s in states]),
+        steps=torch.cat([s.steps for s in states]),
+        variables={k: torch.cat([s.variables[k] for s in states]) for k in first.variables},
+    )

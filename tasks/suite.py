@@ -1,0 +1,139 @@
+"""The dm_control face of a task: one simulation as a `dm_control.rl.control.Environment`.
+
+The same description as in the batched face, called with one row: `Physics` holds the same compiled
+model, the dm_control task hands its state over as a `State` and passes on what the description
+returns. Use it with TorchRL's `DMControlWrapper`, with dm_control's viewer, or with anything that
+speaks dm_env.
+"""
+
+from __future__ import annotations
+
+import collections
+from typing import Any
+
+import numpy as np
+import torch
+from dm_control import mujoco
+from dm_control.mujoco import wrapper
+from dm_control.rl import control
+from dm_env import specs
+from torch import Tensor
+
+from tasks.base import Task, create
+from tasks.state import State
+
+
+class SuiteTask(control.Task):
+    """A task description as a dm_control task.
+
+    Args:
+        description: the task.
+        random: seed or random state of the start states, as everywhere in dm_control.
+
+    Attributes:
+        description: the task.
+    """
+
+    def __init__(self, description: Task, random: int | np.random.RandomState | None = None) -> None:
+        if not isinstance(random, np.random.RandomState):
+            random = np.random.RandomState(random)
+        self.description = description
+        self._generator = torch.Generator().manual_seed(int(random.randint(2**31)))
+        self._state: State | None = None
+        self._action = torch.zeros(1, description.action_size, dtype=torch.float64)
+
+    @property
+    def state(self) -> State:
+        """A copy of the current state, one row.
+
+        Raises:
+            RuntimeError: before the first reset.
+        """
+        if self._state is None:
+            raise RuntimeError("expected a started episode, got none; call reset() first")
+        return self._state.clone()
+
+    def initialize_episode(self, physics: mujoco.Physics) -> None:
+        if self._state is None:
+            start = self.description.sample_initial_state(1, self._generator)
+        else:
+            start = self.description.restart(self._state, self._generator)
+        self._state = start.clone()
+        data = physics.data
+        data.qpos[:], data.qvel[:] = start.qpos[0].numpy(), start.qvel[0].numpy()
+        if start.mocap_pos is not None:
+            data.mocap_pos[:] = start.mocap_pos[0].numpy()
+        if start.mocap_quat is not None:
+            data.mocap_quat[:] = start.mocap_quat[0].numpy()
+
+    def before_step(self, action: np.ndarray, physics: mujoco.Physics) -> None:
+        self._action = torch.as_tensor(np.asarray(action, dtype=np.float64)).reshape(1, -1)
+        ctrl = self.description.control(self._action, self._current(physics))
+        physics.set_control(ctrl[0].numpy())
+
+    def after_step(self, physics: mujoco.Physics) -> None:
+        state = self._current(physics)
+        state.steps += 1
+        self._reward = float(self.description.reward(state, self._action))
+        state.variables |= self.description.update(state, self._action)
+
+    # dm_control's base class has no return annotations; `Any` keeps type checkers quiet about it.
+    def get_reward(self, physics: mujoco.Physics) -> Any:
+        return self._reward
+
+    def get_observation(self, physics: mujoco.Physics) -> Any:
+        observation = self.description.observe(self._current(physics))[0]
+        return collections.OrderedDict(observation=observation.to(torch.float64).numpy())
+
+    def get_termination(self, physics: mujoco.Physics) -> Any:
+        over = bool(self.description.terminated(self._current(physics)))
+        return 0.0 if over else None  # the discount of an episode that ends here
+
+    def action_spec(self, physics: mujoco.Physics) -> Any:
+        return specs.BoundedArray((self.description.action_size,), np.float64, -1.0, 1.0, "action")
+
+    def _current(self, physics: mujoco.Physics) -> State:
+        """The state with the physics' present positions and velocities."""
+        if self._state is None:  # asked for a spec before the first reset
+            self._state = self.description.sample_initial_state(1, torch.Generator())
+        self._state.qpos = _row(physics.data.qpos)
+        self._state.qvel = _row(physics.data.qvel)
+        if self._state.mocap_pos is not None:
+            self._state.mocap_pos = _row(physics.data.mocap_pos)
+        if self._state.mocap_quat is not None:
+            self._state.mocap_quat = _row(physics.data.mocap_quat)
+        return self._state
+
+
+def _row(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(values, dtype=np.float64))[None]
+
+
+def load(
+    name: str, random: int | np.random.RandomState | None = None, **task_kwargs: Any
+) -> control.Environment:
+    """dm_control environment of a task, by name: one simulation, float64 observations.
+
+    Args:
+        name: one of ``tasks.ALL_TASKS``.
+        random: seed or random state of the start states.
+        **task_kwargs: arguments of the task, such as ``episode_seconds``.
+
+    Raises:
+        KeyError: no such task; the message lists the names.
+        TypeError: an argument that the task does not take.
+
+    Example:
+        >>> import tasks
+        >>> env = tasks.load("cartpole", random=0)
+        >>> env.reset().observation["observation"].shape, env.control_timestep()
+        ((3,), 0.02)
+    """
+    description = create(name, **task_kwargs)
+    physics = mujoco.Physics.from_model(wrapper.MjModel(description.model))
+    return control.Environment(
+        physics,
+        SuiteTask(description, random),
+        time_limit=description.max_steps * description.control_timestep,
+        n_sub_steps=description.substeps,
+    )
