@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 _TOLERANCE = 1e-9
+_DISTINCT = 1e-6  # elements that differ by less are one and the same
 _MAX_ORDER = 120  # the largest finite rotation group with reflections, that of the icosahedron
 _EXACT = sorted({s * v for s in (-1, 1) for v in (0.0, 0.5, math.sqrt(0.5), math.sqrt(0.75), 1.0)})
 
@@ -63,6 +64,8 @@ class PointGroup:
         matrices = torch.as_tensor(matrices, dtype=torch.float64)
         if matrices.ndim != 3 or matrices.shape[1:] != (3, 3):
             raise ValueError(f"expected matrices of shape (N, 3, 3), got {tuple(matrices.shape)}")
+        if len(matrices) == 0:
+            raise ValueError("expected at least the identity, got no elements")
         eye = torch.eye(3, dtype=torch.float64)
         for i, matrix in enumerate(matrices):
             if not torch.allclose(matrix @ matrix.T, eye, rtol=0, atol=_TOLERANCE):
@@ -78,6 +81,11 @@ class PointGroup:
             raise ValueError(
                 f"expected {len(matrices)} distinct names, got {list(self.names)}; "
                 "is an element listed twice?"
+            )
+        distance = (self.matrices[:, None] - self.matrices).abs().amax(dim=(-2, -1))
+        for i, j in (distance < _DISTINCT).triu(diagonal=1).nonzero().tolist():
+            raise ValueError(
+                f"expected distinct elements, but {self.names[i]!r} and {self.names[j]!r} are the same"
             )
         self.table = self._product_table()
         self.inverse = (self.table == 0).long().argmax(dim=1)
@@ -170,7 +178,7 @@ class PointGroup:
         for known, word in zip(found, words, strict=True):  # both lists grow while they are walked
             for name, move in moves.items():
                 candidate = _snap(move @ known)
-                if all((candidate - f).abs().max() > 1e-6 for f in found):
+                if all((candidate - f).abs().max() > _DISTINCT for f in found):
                     found.append(candidate)
                     words.append(name if word == "identity" else f"{name}*{word}")
             if len(found) > _MAX_ORDER:
