@@ -1,0 +1,120 @@
+"""Hyper-parameters of the PPO recipe, in one frozen dataclass."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """What to train with; every default is a value that quadruped and cart-pole PPO is run with.
+
+    Raises:
+        ValueError: a number outside its range; the message names the field.
+    """
+
+    augmentation: Literal["none", "all", "random", "naive"] = "all"
+    """Symmetric copies: none (plain PPO); all of the orbit, or one random element per row, with the
+    original log-probability (Eq. sym-aug); or naive, with log-probability and advantage re-evaluated."""
+    mirror_coeff: float = 0.0
+    """Weight w of the mirror loss (Eq. symm-loss), summed over group and action entries."""
+    seed: int = 0
+    """Seed of network weights, start states and exploration."""
+
+    iterations: int = 400
+    """Collect-and-learn rounds."""
+    num_envs: int = 256
+    """Parallel environments."""
+    horizon: int = 32
+    """Steps per environment and iteration."""
+    epochs: int = 4
+    """Passes over the data of an iteration."""
+    minibatches: int = 4
+    """Minibatches per pass."""
+
+    gamma: float = 0.98
+    """Discount; 0.98 is 1 s at 50 Hz. 0.99 was slower on CartPole."""
+    lmbda: float = 0.95
+    """GAE's lambda."""
+    clip_epsilon: float = 0.2
+    """Clip range of the probability ratio."""
+    clip_value: float | None = 0.2
+    """Clip range of the value's change, None for no clipping."""
+    critic_coeff: float = 1.0
+    """Weight of the (squared) value loss."""
+    entropy_coeff: float = 0.02
+    """Weight of the entropy bonus; at 0.005 CartPole's exploration dies before it swings up."""
+    max_grad_norm: float = 1.0
+    """Gradient norm over all parameters above which it is scaled down."""
+
+    learning_rate: float = 1e-3
+    """Adam's step size, at the start if it is adaptive."""
+    desired_kl: float | None = 0.01
+    """Policy change per update that the learning rate is adapted to (rsl_rl's rule: divided by 1.5
+    above twice this value, multiplied by 1.5 below half of it). None keeps it constant."""
+    min_learning_rate: float = 1e-5
+    """Lower end of the adaptive learning rate."""
+    max_learning_rate: float = 1e-2
+    """Upper end of the adaptive learning rate."""
+
+    hidden: tuple[int, ...] = (32, 32)
+    """Sizes of the hidden layers of actor and critic (ELU)."""
+    initial_std: float = 1.0
+    """Standard deviation of the policy at the start; it is learned, and does not depend on the state."""
+    min_std: float = 0.05
+    """Lower bound of the standard deviation."""
+    max_std: float = 10.0
+    """Upper bound of the standard deviation: clipped actions make a large one free of cost."""
+    weight_scale: float = 1.0
+    """Factor on PyTorch's uniform initialisation of the actor (the paper's initialisation study)."""
+    last_layer_scale: float = 1.0
+    """Further factor on the actor's last layer; 0.1 is usual for legged robots."""
+
+    max_log_ratio: float = 20.0
+    """Bound of log pi / pi_k for naive augmentation, which overflows without."""
+    checkpoint_interval: int = 1
+    """Iterations between checkpoints; the last one is always saved."""
+    device: str = "cpu"
+    """Where networks and updates live; physics stays on the CPU."""
+
+    def __post_init__(self) -> None:
+        choices = ("none", "all", "random", "naive")
+        if self.augmentation not in choices:
+            raise ValueError(f"augmentation: expected one of {choices}, got {self.augmentation!r}")
+        counts = ("iterations", "num_envs", "horizon", "epochs", "minibatches", "checkpoint_interval")
+        for name in counts:
+            value = getattr(self, name)
+            if value < 1 or int(value) != value:
+                raise ValueError(f"{name}: expected a whole number of at least 1, got {value}")
+        for name in ("learning_rate", "max_grad_norm", "initial_std", "min_std", "max_std"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("gamma", "lmbda"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}")
+        if not self.mirror_coeff >= 0:
+            raise ValueError(f"mirror_coeff: expected a number >= 0, got {self.mirror_coeff}")
+        if self.num_envs * self.horizon % self.minibatches:
+            raise ValueError(
+                f"minibatches: expected a divisor of num_envs * horizon = {self.num_envs * self.horizon}, "
+                f"got {self.minibatches}"
+            )
+
+    def differences(self, other: dict) -> dict[str, tuple]:
+        """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
+
+        The number of iterations and the checkpoint interval may change when a run is continued.
+        """
+        mine = dataclasses.asdict(self)
+        free = {"iterations", "checkpoint_interval"}
+        return {
+            name: (other.get(name), value)
+            for name, value in mine.items()
+            if name not in free and _plain(other.get(name)) != _plain(value)
+        }
+
+
+def _plain(value):
+    return list(value) if isinstance(value, tuple) else value

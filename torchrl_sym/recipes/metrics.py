@@ -1,0 +1,81 @@
+"""What the recipe measures: returns of finished episodes, and how symmetric the policy is."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.envs import EnvBase
+
+from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.symmetry import Symmetry
+
+_MAX_ROWS = 2048  # rows on which the symmetry metrics are evaluated
+
+
+class Episodes:
+    """Undiscounted returns of finished episodes, across iterations.
+
+    Args:
+        env: the environment whose batches will be seen; its batch size is the number of episodes
+            that run side by side.
+    """
+
+    def __init__(self, env: EnvBase) -> None:
+        self.running = torch.zeros(env.batch_size.numel())
+        self.latest = math.nan
+
+    def update(self, data: TensorDictBase) -> float:
+        """Mean return of the episodes that ended in a batch ``[*env, T]``; if none did, the last mean."""
+        rewards, dones = (
+            data["next", key].cpu().reshape(len(self.running), -1) for key in ("reward", "done")
+        )
+        finished = []
+        for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
+            self.running = self.running + reward
+            finished.append(self.running[done])
+            self.running = self.running.masked_fill(done, 0.0)
+        returns = torch.cat(finished)
+        if len(returns):
+            self.latest = float(returns.mean())
+        return self.latest
+
+    def state_dict(self) -> dict[str, Any]:
+        """Returns of the running episodes and the last mean."""
+        return {"running": self.running.clone(), "latest": self.latest}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from a stored state."""
+        self.running = state["running"].clone()
+        self.latest = state["latest"]
+
+
+@torch.no_grad()
+def symmetry_metrics(
+    actor: ProbabilisticTensorDictSequential, symmetry: Symmetry, data: TensorDictBase
+) -> dict[str, float]:
+    """How symmetric a policy is on states it visits.
+
+    Args:
+        actor: the policy pi_k that collected the data.
+        symmetry: what transforms how.
+        data: a batch with observations and actions, of any batch size; 2048 rows of it are used.
+
+    Returns:
+        ``mirror_loss``, sum_g || K_g[pi(s)] - pi(L_g[s]) ||^2 (Eq. symm-loss); ``log_prob``, the mean of
+        log pi_k(a | s); ``log_prob_copies``, the mean of log pi_k(K_g[a] | L_g[s]) over the copies, the
+        denominator of naive augmentation (the paper's log-probability figure).
+    """
+    rows = data.select(*actor.in_keys, "action").reshape(-1)
+    rows = rows[:: max(1, len(rows) // _MAX_ROWS)]
+    orbit = symmetry.orbit(rows)
+    log_prob = actor.get_dist(orbit.select(*actor.in_keys)).log_prob(orbit["action"])  # (N, rows)
+    copies = log_prob[1:] if len(log_prob) > 1 else log_prob
+    return {
+        "mirror_loss": float(MirrorLoss(actor, symmetry=symmetry)(rows)["loss_mirror"]),
+        "log_prob": float(log_prob[0].mean()),
+        "log_prob_copies": float(copies.mean()),
+    }

@@ -1,0 +1,307 @@
+"""PPO with symmetry, one linear loop of TorchRL parts: collect, estimate advantages, learn.
+
+Read :func:`train` from top to bottom; the helpers below it are in the order of their use. Advantages are
+estimated once per iteration and before any augmentation: the value of a copy would otherwise be V(L_g s)
+and its advantage not the A_k(s, a) of Eq. (sym-aug).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+import time
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
+from torchrl.envs import EnvBase
+from torchrl.modules import ValueOperator
+from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR, LossModule
+from torchrl.objectives.value import GAE
+from tqdm import tqdm
+
+from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
+from torchrl_sym.recipes.networks import make_actor, make_critic
+from torchrl_sym.recipes.storage import RunFolder, make_logger
+from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
+from torchrl_sym.symmetry import Symmetry
+from torchrl_sym.transforms import SymmetryAugment
+
+
+class MakeEnv(Protocol):
+    """Makes the training environment, e.g. ``functools.partial(tasks.make_env, "cartpole")``."""
+
+    def __call__(self, *, num_envs: int, seed: int) -> EnvBase: ...
+
+
+def train(
+    config: PPOConfig,
+    make_env: MakeEnv,
+    symmetry: Symmetry,
+    *,
+    folder: str | os.PathLike | None = None,
+    logger: str | None = "csv",
+    progress: bool = False,
+) -> Iterator[dict[str, float]]:
+    """Train, yielding one dictionary of metrics per iteration.
+
+    With a folder, the run can be killed at any time and continues when called again, exactly: on one
+    thread the metrics are those of a run that was never interrupted. This needs an environment with
+    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have; others begin new episodes.
+
+    Args:
+        config: hyper-parameters.
+        make_env: called with ``num_envs`` and ``seed``.
+        symmetry: what transforms how. Its observation keys are what actor and critic read. Also used,
+            as a metric, when nothing is augmented.
+        folder: where metrics and checkpoints go; nothing is written by default.
+        logger: ``"csv"`` (metrics.csv only), or also ``"tensorboard"`` or ``"wandb"``.
+        progress: show a progress bar.
+
+    Yields:
+        iteration, frames, return (mean of the latest finished episodes), mirror_loss, log_prob and
+        log_prob_copies (mean log pi_k of samples and of their copies), kl, losses, learning rate, time.
+
+    Raises:
+        ValueError: the folder holds a run with another configuration.
+        KeyError, ValueError: the environment and the symmetry do not fit.
+        FloatingPointError: a loss is not finite; the last checkpoint is still good.
+
+    Example:
+        >>> import functools, tasks
+        >>> from torchrl_sym.recipes import PPOConfig, train
+        >>> make_env = functools.partial(tasks.make_env, "cartpole", num_threads=1)
+        >>> symmetry = make_env(num_envs=1).symmetry
+        >>> config = PPOConfig(iterations=2, num_envs=8, horizon=8)
+        >>> [metrics["frames"] for metrics in train(config, make_env, symmetry)]
+        [64, 128]
+    """
+    torch.manual_seed(config.seed)
+    env = make_env(num_envs=config.num_envs, seed=config.seed)
+    symmetry.check_specs(env)
+    symmetry = symmetry.to(config.device)
+    actor, critic = make_networks(config, env, symmetry)
+    parameters = [*actor.parameters(), *critic.parameters()]
+    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+    losses = make_loss(config, actor, critic, symmetry)
+    gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=critic, average_gae=True)
+    naive = SymmetryAugment(symmetry, log_prob_from=actor) if config.augmentation == "naive" else None
+    rows = config.num_envs * config.horizon * (symmetry.group.order if naive else 1)
+    buffer = ReplayBuffer(
+        storage=LazyTensorStorage(rows, device=config.device),
+        sampler=SamplerWithoutReplacement(),
+        batch_size=rows // config.minibatches,
+    )
+    schedule = _schedule(config, optimizer)
+    episodes = Episodes(env)
+    run = None if folder is None else RunFolder(folder)
+    parts = {"actor": actor, "critic": critic, "optimizer": optimizer}
+    start, elapsed = _resume(run, config, env, parts, episodes)
+    if start >= config.iterations:
+        return
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=config.num_envs * config.horizon,
+        total_frames=-1,
+        policy_device=config.device,
+        storing_device=config.device,
+        auto_register_policy_transforms=False,
+    )
+    log = make_logger(logger, folder, name="train")
+    bar = tqdm(total=config.iterations, initial=start, disable=not progress, unit="it")
+    clock = time.perf_counter() - elapsed
+    try:
+        for iteration, data in enumerate(collector, start + 1):
+            metrics = {"iteration": iteration, "frames": iteration * data.numel()}
+            metrics["return"] = episodes.update(data)
+            metrics |= symmetry_metrics(actor, symmetry, data)
+            if naive is not None:
+                data = naive(data)  # before GAE: also the advantage is that of the copies
+            with torch.no_grad():
+                gae(data)
+            buffer.extend(data.select(*_batch_keys(actor, critic)).reshape(-1))
+            metrics |= _learn(config, losses, buffer, optimizer, schedule, parameters)
+            metrics["std"] = float(data["scale"][..., 0, :].mean())
+            metrics["seconds"] = time.perf_counter() - clock
+            metrics["frames_per_second"] = metrics["frames"] / metrics["seconds"]
+            if run is not None:
+                run.append(metrics)
+                if iteration % config.checkpoint_interval == 0 or iteration >= config.iterations:
+                    run.save(_snapshot(config, env, parts, episodes, iteration, metrics["seconds"]))
+            if log is not None:
+                log.log_metrics(metrics, step=iteration)
+            bar.update()
+            bar.set_postfix_str(
+                f"return {metrics['return']:.2f} mirror {metrics['mirror_loss']:.3g}", refresh=False
+            )
+            yield metrics
+            if iteration >= config.iterations:
+                break
+            collector.update_policy_weights_()
+    finally:
+        bar.close()
+        collector.shutdown(close_env=True)
+
+
+def make_networks(
+    config: PPOConfig, env: EnvBase, symmetry: Symmetry
+) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
+    """Actor and critic that read every observation of the environment that the symmetry declares."""
+    keys = [key for key in symmetry.keys() if key in env.observation_spec.keys(True, True)]  # noqa: SIM118
+    if not keys:
+        raise KeyError(
+            f"the environment observes {list(env.observation_spec.keys(True, True))}, none of which the "
+            f"symmetry declares ({symmetry.keys()}); add them"
+        )
+    size = sum(env.observation_spec[key].shape[-1] for key in keys)
+    actor = make_actor(config, keys, size, env.action_spec.shape[-1]).to(config.device)
+    return actor, make_critic(config, keys, size).to(config.device)
+
+
+def load_actor(
+    folder: str | os.PathLike, env: EnvBase, symmetry: Symmetry
+) -> ProbabilisticTensorDictSequential:
+    """The trained policy of a run.
+
+    Args:
+        folder: where :func:`train` wrote its checkpoint.
+        env: an environment with the observations and actions of the training environment.
+        symmetry: the symmetry that was passed to :func:`train`.
+
+    Raises:
+        FileNotFoundError: there is no checkpoint.
+    """
+    checkpoint = RunFolder(folder).load()
+    if checkpoint is None:
+        raise FileNotFoundError(f"expected a checkpoint in {folder}, found none; train there first")
+    stored = {name: _tuple(value) for name, value in checkpoint["config"].items()}
+    actor, _ = make_networks(dataclasses.replace(PPOConfig(**stored), device="cpu"), env, symmetry)
+    actor.load_state_dict(checkpoint["parts"]["actor"])
+    return actor
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def make_loss(
+    config: PPOConfig, actor: ProbabilisticTensorDictSequential, critic: ValueOperator, symmetry: Symmetry
+) -> list[LossModule]:
+    """The losses to add up: PPO with or without copies, and a mirror loss where none is built in."""
+    kwargs: dict[str, Any] = {
+        "clip_epsilon": config.clip_epsilon,
+        "clip_value": config.clip_value,
+        "critic_coeff": config.critic_coeff,
+        "entropy_coeff": config.entropy_coeff,
+        "loss_critic_type": "l2",
+    }
+    if config.augmentation in ("all", "random"):
+        kwargs |= {"elements": config.augmentation, "mirror_coeff": config.mirror_coeff}
+        return [SymmetricClipPPOLoss(actor, critic, symmetry=symmetry, **kwargs)]
+    if config.augmentation == "naive":
+        kwargs["max_importance_ratio"] = math.exp(config.max_log_ratio)
+    losses: list[LossModule] = [ClipPPOLoss(actor, critic, **kwargs)]
+    if config.mirror_coeff > 0:
+        losses.append(MirrorLoss(actor, symmetry=symmetry, coeff=config.mirror_coeff))
+    return losses
+
+
+def _batch_keys(actor: ProbabilisticTensorDictSequential, critic: ValueOperator) -> list:
+    own = ["action", *actor.log_prob_keys, "advantage", "value_target", "state_value"]
+    return list(dict.fromkeys([*actor.in_keys, *critic.in_keys, *own]))
+
+
+def _learn(
+    config: PPOConfig,
+    losses: list[LossModule],
+    buffer: ReplayBuffer,
+    optimizer: torch.optim.Optimizer,
+    schedule: KLAdaptiveLR | None,
+    parameters: list[nn.Parameter],
+) -> dict[str, float]:
+    """Some epochs of minibatch updates; returns the mean of every reported quantity."""
+    sums: dict[str, Tensor] = {}
+    updates = config.epochs * config.minibatches
+    for _ in range(config.epochs):
+        for minibatch in buffer:
+            out = {key: value for loss in losses for key, value in loss(minibatch).items()}
+            total = torch.stack([value for key, value in out.items() if key.startswith("loss_")]).sum()
+            optimizer.zero_grad()
+            total.backward()
+            norm = nn.utils.clip_grad_norm_(parameters, config.max_grad_norm)
+            if not norm.isfinite():
+                raise FloatingPointError(
+                    f"the gradient is {norm.item()}, with losses "
+                    f"{ {k: v.item() for k, v in out.items() if k.startswith('loss_')} }; lower "
+                    "learning_rate or max_learning_rate, or bound the std"
+                )
+            optimizer.step()
+            # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
+            out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
+            if schedule is not None:
+                schedule.step(out["kl"])
+            for key in ("kl", "clip_fraction", "entropy", "loss_objective", "loss_critic"):
+                sums[key] = sums.get(key, 0.0) + out[key].detach()
+    metrics = {key: float(value) / updates for key, value in sums.items()}
+    return metrics | {"learning_rate": optimizer.param_groups[0]["lr"]}
+
+
+def _schedule(config: PPOConfig, optimizer: torch.optim.Optimizer) -> KLAdaptiveLR | None:
+    if config.desired_kl is None:
+        return None
+    bounds = {"min_lr": config.min_learning_rate, "max_lr": config.max_learning_rate}
+    return KLAdaptiveLR(optimizer, config.desired_kl, **bounds)
+
+
+def _snapshot(
+    config: PPOConfig,
+    env: EnvBase,
+    parts: dict[str, Any],
+    episodes: Episodes,
+    iteration: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """Everything that decides the future of the run, as plain containers of tensors and numbers."""
+    save_env = getattr(env, "save_state", None)
+    return {
+        "config": dataclasses.asdict(config),
+        "iteration": iteration,
+        "seconds": seconds,
+        "parts": {name: part.state_dict() for name, part in parts.items()},
+        "episodes": episodes.state_dict(),
+        "rng": torch.get_rng_state(),
+        "env": None if save_env is None else save_env(),
+    }
+
+
+def _resume(
+    run: RunFolder | None, config: PPOConfig, env: EnvBase, parts: dict[str, Any], episodes: Episodes
+) -> tuple[int, float]:
+    """Load the folder's checkpoint, if any; returns the iterations done and the seconds they took."""
+    checkpoint = None if run is None else run.load()
+    if run is None or checkpoint is None:
+        if run is not None:
+            run.truncate(0)  # a row that was logged before the first checkpoint
+        return 0, 0.0
+    differences = config.differences(checkpoint["config"])
+    if differences:
+        raise ValueError(
+            f"{run.path} holds a run with another configuration, {{field: (stored, requested)}} = "
+            f"{differences}; use another folder, or delete this one to start anew"
+        )
+    for name, part in parts.items():
+        part.load_state_dict(checkpoint["parts"][name])
+    episodes.load_state_dict(checkpoint["episodes"])
+    if checkpoint["env"] is not None:
+        env.restore_state(checkpoint["env"])  # pyright: ignore[reportAttributeAccessIssue]
+    torch.set_rng_state(checkpoint["rng"])
+    run.truncate(checkpoint["iteration"])
+    return checkpoint["iteration"], checkpoint["seconds"]
