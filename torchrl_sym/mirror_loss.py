@@ -107,7 +107,9 @@ class MirrorLoss(LossModule):
         self.per_element = per_element
         self.reduction = "mean" if reduction is None else reduction
         self.register_coeff_buffer("coeff", coeff)
-        self._output_representation()
+        self._follow_network()
+        if self._is_policy():  # any other output may still be named with set_keys
+            self._output_representation()
         symmetry.require(actor_network.in_keys, "the network")
 
     @property
@@ -141,10 +143,25 @@ class MirrorLoss(LossModule):
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
 
+    def _follow_network(self) -> None:
+        """Take over the key of the action that the network writes, where it can be told."""
+        network, keys = self.actor_network, self.tensor_keys
+        written = network.out_keys
+        if hasattr(network, "dist_sample_keys"):
+            self.set_keys(action=network.dist_sample_keys[0])
+        elif keys.action not in written and keys.value not in written:
+            declared = set(self.symmetry.keys()) & set(written) - set(network.in_keys)
+            if len(declared) == 1:
+                self.set_keys(action=declared.pop())
+
+    def _is_policy(self) -> bool:
+        network = self.actor_network
+        return self.tensor_keys.action in network.out_keys or hasattr(network, "get_dist")
+
     def _output_representation(self) -> Representation:
         """K_g of what the network puts out; a critic's value is invariant."""
         written = self.actor_network.out_keys
-        if self.tensor_keys.action in written or hasattr(self.actor_network, "get_dist"):
+        if self._is_policy():
             return self.symmetry[self.tensor_keys.action]
         if self.tensor_keys.value in written:
             return invariant(self.symmetry.group, 1)
@@ -203,7 +220,11 @@ def squared_distance(output: Tensor, label: Tensor) -> Tensor:
 
 
 def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
-    """Give a keyword call's tensordict (batch size []) the batch size of one of its entries."""
-    if tensordict.batch_dims == 0:
-        tensordict.batch_size = tensordict.get(key).shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
+    """Give a tensordict that a keyword call has built the batch size of one of its entries.
+
+    ``dispatch`` takes the longest shape that all entries share, at times with their last dimension.
+    """
+    value = tensordict.get(key)
+    if tensordict.batch_dims in (0, value.ndim):
+        tensordict.batch_size = value.shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
     return tensordict
