@@ -81,10 +81,11 @@ def quaternion(group: PointGroup, action: Action = "left", *, scalar_last: bool 
     """
     _check_action(group, action, "quaternion")
     proper = group.det[:, None, None] * group.matrices
-    left = torch.stack([_left_product(_to_quaternion(m)) for m in proper])
+    turns = [_to_quaternion(m) for m in proper]
+    left = torch.stack([_left_product(q) for q in turns])
     if action == "conjugate":
-        right = torch.stack([_right_product(_to_quaternion(m.mT)) for m in proper])
-        matrices = left @ right
+        inverse = torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)  # of this q, not of -q
+        matrices = left @ torch.stack([_right_product(inverse * q) for q in turns])
     else:
         matrices = _lift(group, left)
     if scalar_last:
