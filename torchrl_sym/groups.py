@@ -166,7 +166,8 @@ class PointGroup:
                 matrix @ matrix.mT, eye, rtol=0, atol=_TOLERANCE
             ):
                 raise ValueError(
-                    f"generator {name!r}: expected an orthogonal 3 x 3 matrix, got {matrix.tolist()}"
+                    f"generator {name!r}: expected an orthogonal 3 x 3 matrix, got {matrix.tolist()}; "
+                    f"it must be orthogonal to {_TOLERANCE:g}, so compute it in float64"
                 )
             if fixes_vertical and abs(matrix[2, 2].item() - 1) > _TOLERANCE:
                 raise ValueError(

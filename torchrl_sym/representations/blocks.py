@@ -8,6 +8,8 @@ to apply them; :class:`~torchrl_sym.representations.Representation` strings bloc
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor, nn
 
@@ -54,8 +56,8 @@ class SignedPermutation(nn.Module):
     def _flip(self, x: Tensor, sign: Tensor) -> Tensor:
         if not self._flips:
             return x
-        if x.dtype == torch.bool:
-            raise TypeError("expected numbers, got a bool tensor for entries that change sign")
+        if not x.dtype.is_signed:
+            raise TypeError(f"expected signed numbers, got a {x.dtype} tensor: some entries change sign")
         return x * sign.to(x.dtype)
 
     def product_residual(self, table: Tensor) -> Tensor:
@@ -100,10 +102,10 @@ class Dense(nn.Module):
         self.dim = matrices.shape[-1]
 
     def element(self, x: Tensor, g: int) -> Tensor:
-        return x @ self.dense[g].mT.to(x.dtype)
+        return x @ _like(x, self.dense[g]).mT
 
     def rows(self, x: Tensor, g: Tensor) -> Tensor:
-        return (self.dense.to(x.dtype)[g] @ x.unsqueeze(-1)).squeeze(-1)
+        return (_like(x, self.dense)[g] @ x.unsqueeze(-1)).squeeze(-1)
 
     def orbit(self, x: Tensor) -> Tensor:
         return torch.stack([self.element(x, g) for g in range(len(self.dense))])
@@ -132,6 +134,12 @@ class Dense(nn.Module):
         )
 
 
+def _like(x: Tensor, matrices: Tensor) -> Tensor:
+    if not x.dtype.is_floating_point:
+        raise TypeError(f"expected real numbers, got a {x.dtype} tensor: some entries are mixed")
+    return matrices.to(x.dtype)
+
+
 Block = SignedPermutation | Dense
 
 
@@ -152,7 +160,7 @@ def merge(blocks: list[Block]) -> list[Block]:
     for block in blocks:
         joined = merged[-1].join(block) if merged else None
         if joined is None:
-            merged.append(block)
+            merged.append(copy.deepcopy(block))  # so that moving one representation moves no other
         else:
             merged[-1] = joined
     return merged
