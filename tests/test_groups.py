@@ -10,41 +10,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.point_groups import CYCLE_AXES, GROUPS, QUARTER_TURN, cube, every_group
 from torchrl_sym import PointGroup
 
-QUARTER_TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-CYCLE_AXES = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # 120 degrees about (1, 1, 1)
+ORDERS = dict(zip(GROUPS, [1, 2, 2, 2, 3, 4, 4, 6, 8, 5, 12, 24], strict=True))
+INTEGER_ENTRIES = ["trivial", "reflect-x", "reflect-y", "C2", "K4", "C4", "D4", "cube"]
 
 
 def turn(angle: float) -> torch.Tensor:
     c, s = math.cos(angle), math.sin(angle)
     return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
-
-
-def cube() -> PointGroup:
-    """The 24 rotations of the cube, which do not fix the vertical axis."""
-    generators = {"turn": QUARTER_TURN, "cycle": CYCLE_AXES}
-    return PointGroup.generate(generators, fixes_vertical=False)
-
-
-GROUPS = {
-    "trivial": PointGroup.trivial(),
-    "reflect-x": PointGroup.reflection("x"),
-    "reflect-y": PointGroup.reflection("y"),
-    "C2": PointGroup.rotation(2),
-    "C3": PointGroup.rotation(3),
-    "K4": PointGroup.klein_four(),
-    "C4": PointGroup.rotation(4),
-    "D3": PointGroup.dihedral(3),
-    "D4": PointGroup.dihedral(4),
-    "C5": PointGroup.rotation(5),
-    "D6": PointGroup.dihedral(6),
-    "cube": cube(),
-}
-ORDERS = dict(zip(GROUPS, [1, 2, 2, 2, 3, 4, 4, 6, 8, 5, 12, 24], strict=True))
-INTEGER_ENTRIES = ["trivial", "reflect-x", "reflect-y", "C2", "K4", "C4", "D4", "cube"]
-
-every_group = pytest.mark.parametrize("group", GROUPS.values(), ids=GROUPS)
 
 
 # --- axioms
