@@ -16,6 +16,7 @@ import abc
 import difflib
 import importlib.resources
 import inspect
+import math
 from typing import Any, ClassVar, TypeVar
 
 import mujoco
@@ -75,6 +76,11 @@ class Task(abc.ABC):
                 f"({self.control_timestep} s), got {self.episode_seconds}"
             )
         self.model = load_model(self.asset)
+        if not math.isclose(self.substeps * self.model.opt.timestep, self.control_timestep):
+            raise ValueError(
+                f"expected a control_timestep that is a multiple of the model's timestep "
+                f"{self.model.opt.timestep} s, got {self.control_timestep} s; change one of the two"
+            )
 
     @property
     def substeps(self) -> int:
@@ -107,7 +113,7 @@ class Task(abc.ABC):
         """Start states for rows whose episode is over; a curriculum judges ``finished`` here.
 
         Args:
-            finished: the last state of these rows; ``finished.steps`` is 0 where no step was made.
+            finished: the last state of these rows; ``finished.time`` is 0 where no step was made.
             generator: the environment's generator; draw from nothing else.
         """
         return self.sample_initial_state(len(finished), generator)
@@ -144,9 +150,9 @@ class Task(abc.ABC):
     def reward(self, state: State, action: Tensor) -> Tensor:
         """Reward of the step that led to ``state`` by ``action``, ``(n,)``."""
 
-    def terminated(self, state: State) -> Tensor:
-        """Whether the episode ends here with no future value, ``(n,)`` bool; never by default."""
-        return torch.zeros(len(state), dtype=torch.bool)
+    def terminated(self, state: State) -> Tensor | None:
+        """Whether the episode ends here with no future value, ``(n,)`` bool; None: in no row."""
+        return None
 
     @abc.abstractmethod
     def transform_state(self, state: State, g: Element) -> State:

@@ -89,21 +89,23 @@ class CartPole(Task):
 
         The cart's position is left out: the rail has no end, so nothing depends on it.
         """
-        cart_velocity, pole_velocity = state.qvel.unbind(-1)
-        pole = torch.stack([cart_velocity, _angle(state), pole_velocity], dim=-1)
-        return pole.div_(self._scale)
+        observation = state.qvel.new_empty(len(state), 3)
+        observation[:, ::2] = state.qvel
+        observation[:, 1] = _angle(state)
+        return observation.div_(self._scale)
 
     def reward(self, state: State, action: Tensor) -> Tensor:
         """Minus the pole's distance from upright, over the time of the step, rad s."""
-        return -_angle(state).abs() * self.control_timestep
+        return _angle(state).abs_().mul_(-self.control_timestep)
 
     def transform_state(self, state: State, g: Element) -> State:
         """Mirror cart and pole."""
         flip = self._coordinates
-        return State(flip(state.qpos, g), flip(state.qvel, g), steps=state.steps.clone())
+        return State(flip(state.qpos, g), flip(state.qvel, g), time=state.time.clone())
 
 
 def _angle(state: State) -> Tensor:
     """Pole angle from upright, in [-pi, pi], rad; odd in floating-point arithmetic (see above)."""
     angle = state.qpos[:, 1]
-    return angle - (angle * (0.5 / math.pi)).round_() * (2 * math.pi)
+    turns = (angle * (0.5 / math.pi)).round_()
+    return angle.sub(turns, alpha=2 * math.pi)

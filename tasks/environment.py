@@ -68,10 +68,18 @@ class BatchedEnv(EnvBase):
         self.num_diverged = 0
         self._generator = torch.Generator()
         self._make_specs()
-        self._max_steps = task.max_steps
+        self._check_task()
         self._substeps = task.substeps
+        # Time adds up rounding errors; half a control step is far above them.
+        self._time_limit = (task.max_steps - 0.5) * task.control_timestep
         # The state of all rows; its positions and velocities are the simulation's own memory.
-        self._state = State(simulation.qpos, simulation.qvel, simulation.mocap_pos, simulation.mocap_quat)
+        self._state = State(
+            simulation.qpos,
+            simulation.qvel,
+            simulation.mocap_pos,
+            simulation.mocap_quat,
+            simulation.time,
+        )
         self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
         self._started = False
         self._restored = False
@@ -103,6 +111,16 @@ class BatchedEnv(EnvBase):
         self.reward_spec = Unbounded(torch.Size((n, 1)), **real)
         self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
 
+    def _check_task(self) -> None:
+        """Sizes, boxes and goals agree with the symmetry: better now than after a night's training."""
+        group, names = self.task.symmetry.group, self.task.goal_names
+        if len(names) != group.order:
+            raise ValueError(
+                f"expected one goal name per group element {list(group.names)}, got {list(names)}; "
+                f"correct goal_names of task {self.task.name!r}"
+            )
+        self.task.symmetry.check_specs(self)
+
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
             self._generator.seed()
@@ -114,34 +132,37 @@ class BatchedEnv(EnvBase):
         task, state, simulation = self.task, self._state, self.simulation
         action = tensordict.get("action").detach().cpu()
         active = tensordict.get("_step", None)  # TorchRL skips rows that are done in some rollouts
-        if active is None:
-            simulation.step(task.control(action, state), self._substeps)
-            state.steps += 1
-        else:
+        if active is not None:
             active = active.reshape(-1).cpu()
-            simulation.step(task.control(action, state), self._substeps, active)
-            state.steps += active
-        diverged = simulation.diverged()
-        some_diverged = bool(diverged.any())
-        if some_diverged:
+        diverged = None
+        if simulation.step(task.control(action, state), self._substeps, active):
+            diverged = simulation.diverged()
             self.num_diverged += int(diverged.sum())
             action = action.masked_fill(diverged[:, None], 0.0)
         reward = task.reward(state, action)
         for name, value in task.update(state, action).items():
-            state.variables[name].copy_(value)
+            rows = slice(None) if active is None else active
+            state.variables[name][rows] = value[rows].to(state.variables[name].dtype)
+        truncated = state.time > self._time_limit
         terminated = task.terminated(state)
-        if some_diverged:
+        if terminated is None:
+            terminated = torch.zeros_like(truncated)
+        if diverged is not None:
             reward = reward.masked_fill(diverged, 0.0)
             terminated = terminated | diverged
-        truncated = state.steps >= self._max_steps
-        self._over = terminated | truncated
+        over = terminated | truncated
+        self._over = over if active is None else torch.where(active, over, self._over)
         return self._output(
             observation=task.observe(state).to(torch.float32),
-            reward=reward.to(torch.float32)[:, None],
-            done=self._over[:, None].clone(),
-            terminated=terminated[:, None],
-            truncated=truncated[:, None],
+            reward=reward.to(torch.float32).unsqueeze(-1),
+            done=over.unsqueeze(-1).clone(),
+            terminated=terminated.unsqueeze(-1),
+            truncated=truncated.unsqueeze(-1),
         )
+
+    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
+        # TorchRL completes shapes and flags here; ours are complete, and it costs as much as _step.
+        return next_tensordict_out
 
     def _output(self, **entries: Tensor) -> TensorDict:
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
@@ -166,7 +187,7 @@ class BatchedEnv(EnvBase):
         """Start an episode of every row from a given state, as for evaluation.
 
         Args:
-            state: n rows; ``state.steps`` counts towards the step limit.
+            state: n rows; ``state.time`` counts towards the time limit.
 
         Returns:
             What :meth:`reset` returns.
@@ -191,11 +212,10 @@ class BatchedEnv(EnvBase):
         return self._first_output()
 
     def _write(self, ids: Tensor, start: State) -> None:
-        self.simulation.write(ids, start.qpos, start.qvel, start.mocap_pos, start.mocap_quat)
+        self.simulation.write(ids, start.qpos, start.qvel, start.mocap_pos, start.mocap_quat, start.time)
         if not self._started:  # the first full reset says which variables the task has
             self._state.variables = {name: x.clone() for name, x in start.variables.items()}
             self._started = True
-        self._state.steps[ids] = start.steps
         for name, value in start.variables.items():
             self._state.variables[name][ids] = value
         self._over[ids] = False
@@ -212,12 +232,11 @@ class BatchedEnv(EnvBase):
     def save_state(self) -> dict[str, Any]:
         """Everything that decides the future of this environment, as copied tensors.
 
-        Physics rows, episode steps, task variables, random generator and curriculum. The dictionary
+        Physics rows (time included), task variables, random generator and curriculum. The dictionary
         can be stored with ``torch.save`` and read with ``weights_only=True``.
         """
         return {
             "simulation": self.simulation.save(),
-            "steps": self._state.steps.clone(),
             "variables": {name: x.clone() for name, x in self._state.variables.items()},
             "over": self._over.clone(),
             "started": self._started,
@@ -247,7 +266,6 @@ class BatchedEnv(EnvBase):
             True
         """
         self.simulation.load(saved["simulation"])
-        self._state.steps.copy_(saved["steps"])
         self._state.variables = {name: x.clone() for name, x in saved["variables"].items()}
         self._over = saved["over"].clone()
         self._started = saved["started"]

@@ -23,10 +23,11 @@ from torch import Tensor
 class Simulation:
     """n simulations of one MuJoCo model, stepped on a thread pool.
 
-    The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``ctrl`` (n, nu), ``mocap_pos`` (n, nmocap,
-    3) and ``mocap_quat`` (n, nmocap, 4) are live float64 views of the simulations' memory in
-    MuJoCo's units (m, rad, s, N): they change with every step, so copy what you keep. Start
-    episodes with :meth:`write`, not through the views: it also clears what the solver remembers.
+    The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``time`` (n,), ``ctrl`` (n, nu),
+    ``mocap_pos`` (n, nmocap, 3) and ``mocap_quat`` (n, nmocap, 4) are live float64 views of the
+    simulations' memory in MuJoCo's units (m, rad, s, N): they change with every step, so copy what
+    you keep. Start episodes with :meth:`write`, not through the views: it also clears what the
+    solver remembers.
 
     Args:
         model: the compiled model; shared by all simulations.
@@ -43,7 +44,8 @@ class Simulation:
         >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody><body>
         ...   <joint type="slide" axis="0 0 1"/><geom size=".1"/></body></worldbody></mujoco>''')
         >>> simulation = Simulation(model, num_envs=3, num_threads=1)
-        >>> simulation.step(torch.zeros(3, 0), substeps=10)
+        >>> simulation.step(torch.zeros(3, 0), substeps=10)  # has any simulation diverged?
+        False
         >>> simulation.qpos.shape, bool((simulation.qvel < 0).all())
         (torch.Size([3, 1]), True)
     """
@@ -68,10 +70,12 @@ class Simulation:
         self._state = torch.from_numpy(self._batch.state)
         self.qpos = self._view("qpos")
         self.qvel = self._view("qvel")
+        self.time = self._view("time")
         self.ctrl = self._view("ctrl")
         self.mocap_pos = self._view("mocap_pos")
         self.mocap_quat = self._view("mocap_quat")
-        self._warnings = self._batch.warning  # (n, kinds, 2) counters, live
+        self._warnings = self._batch.warning  # (n, kinds, 2): last info and count, live
+        self._warnings_flat = self._warnings.reshape(-1)
         self._reference = self._state[0].clone()
         self._none_diverged = torch.zeros(num_envs, dtype=torch.bool)
         self._diverged = self._none_diverged
@@ -80,7 +84,7 @@ class Simulation:
     def _view(self, name: str) -> Tensor:
         return torch.from_numpy(self._batch.bind(name))
 
-    def step(self, ctrl: Tensor, substeps: int = 1, ids: Tensor | None = None) -> None:
+    def step(self, ctrl: Tensor, substeps: int = 1, ids: Tensor | None = None) -> bool:
         """Advance by ``substeps`` timesteps of the model with constant controls.
 
         A row whose control is not finite is stepped with zero control and reported as diverged.
@@ -90,7 +94,15 @@ class Simulation:
             substeps: physics steps per call.
             ids: step only these rows (numbers in increasing order, or a mask); the others stay as
                 they are.
+
+        Returns:
+            Whether any row diverged; :meth:`diverged` says which.
         """
+        if ctrl.shape != self.ctrl.shape:  # copy_ would broadcast
+            raise ValueError(
+                f"expected ctrl of shape {tuple(self.ctrl.shape)} (num_envs, actuators), got "
+                f"{tuple(ctrl.shape)}; check the task's control()"
+            )
         self.ctrl.copy_(ctrl)
         diverged = self._none_diverged
         if not math.isfinite(float(self.ctrl.sum())):
@@ -102,20 +114,24 @@ class Simulation:
             diverged = diverged.clone()
             diverged[torch.as_tensor(error.ids, dtype=torch.int64)] = True
         self._diverged = diverged | self._lost() if self._any_lost() else diverged
-        if self._diverged is not self._none_diverged:
-            self._park(self._diverged)
+        if self._diverged is self._none_diverged:
+            return False
+        self._park(self._diverged)
+        return True
 
     def _any_lost(self) -> bool:
-        """Whether any row may have diverged: three reductions, the only price of a healthy step."""
-        # Maxima propagate NaN, which fails both comparisons; on strided rows they beat sums by far.
-        fastest, farthest = (float(x.abs().amax()) for x in (self.qvel, self.qpos))
-        healthy = fastest <= self.max_velocity and farthest < math.inf
-        return not healthy or bool(self._warnings.any())
+        """Whether any row may have diverged: two reductions, the only price of a healthy step.
+
+        No test for non-finite numbers is needed: MuJoCo checks positions, velocities and
+        accelerations in every step, warns and resets the row.
+        """
+        healthy = float(self.qvel.abs().amax()) <= self.max_velocity  # False for NaN
+        return not healthy or int(self._warnings_flat.max()) > 0
 
     def _lost(self) -> Tensor:
         too_fast = ~(self.qvel.abs() <= self.max_velocity).all(dim=-1)
         warned = torch.from_numpy(self._warnings[:, :, 1].any(axis=-1))
-        return too_fast | ~self.qpos.isfinite().all(dim=-1) | warned
+        return too_fast | warned
 
     def _park(self, rows: Tensor) -> None:
         self._warnings[rows.numpy()] = 0
@@ -136,6 +152,7 @@ class Simulation:
             >>> simulation = Simulation(model, num_envs=2, num_threads=1, max_velocity=100.0)
             >>> simulation.qvel[1] = 1e6
             >>> simulation.step(torch.zeros(2, 0))
+            True
             >>> simulation.diverged()
             tensor([False,  True])
         """
@@ -148,10 +165,11 @@ class Simulation:
         qvel: Tensor,
         mocap_pos: Tensor | None = None,
         mocap_quat: Tensor | None = None,
+        time: Tensor | None = None,
     ) -> None:
         """Start rows afresh: all that is not given returns to the model's defaults.
 
-        That includes the time, the controls, the actuator states and the solver's warm start, which
+        That includes the controls, the actuator states and the solver's warm start, which
         would otherwise carry the previous episode into the next one.
 
         Args:
@@ -160,13 +178,20 @@ class Simulation:
             qvel: ``(k, nv)``.
             mocap_pos: ``(k, nmocap, 3)``, or None for the model's.
             mocap_quat: ``(k, nmocap, 4)``, or None for the model's.
+            time: ``(k,)``, s, or None for zero.
 
         Raises:
             ValueError: a value that is not finite, or a wrong shape.
         """
         rows = slice(None) if ids is None else ids
         k = len(self._none_diverged[rows])
-        fields = {"qpos": qpos, "qvel": qvel, "mocap_pos": mocap_pos, "mocap_quat": mocap_quat}
+        fields = {
+            "qpos": qpos,
+            "qvel": qvel,
+            "mocap_pos": mocap_pos,
+            "mocap_quat": mocap_quat,
+            "time": time,
+        }
         given = {name: value for name, value in fields.items() if value is not None}
         for name, value in given.items():
             expected = (k, *getattr(self, name).shape[1:])
@@ -197,6 +222,12 @@ class Simulation:
     def refresh(self, ids: Tensor | None = None) -> None:
         """Recompute the constants that MuJoCo derives from expanded fields (``mj_setConst``)."""
         self._batch.set_const(None if ids is None else ids.numpy())
+
+    def data(self, row: int) -> mujoco.MjData:  # pyright: ignore[reportAttributeAccessIssue]
+        """One simulation as an ``MjData`` of its own with all derived fields, to be rendered."""
+        data = self._batch.get_data(row)
+        mujoco.mj_forward(self._batch.get_model(row), data)  # pyright: ignore[reportAttributeAccessIssue]
+        return data
 
     def save(self) -> dict[str, Tensor]:
         """Everything that decides the future, copied: state rows, per-simulation model fields."""

@@ -1,7 +1,7 @@
 """The state of a batch of simulations, as a task sees it.
 
 Everything a task computes - observation, reward, termination - is a function of one `State`: what
-the physics holds (positions, velocities, mocap bodies), how many control steps the episode has
+the physics holds (positions, velocities, mocap bodies), how long the episode has
 lasted, and the task's own variables (a target, the last action, a curriculum level). The row index
 is the simulation: every tensor has shape (n, ...).
 """
@@ -27,7 +27,7 @@ class State:
         qvel: generalised velocities, ``(n, nv)`` float64, m/s and rad/s.
         mocap_pos: positions of the mocap bodies, ``(n, nmocap, 3)``, m; None: as in the model.
         mocap_quat: their orientations, ``(n, nmocap, 4)``; None: as in the model.
-        steps: control steps since the start of the episode, ``(n,)`` int64; zero when left out.
+        time: time since the start of the episode, ``(n,)`` float64, s; zero when left out.
         variables: the task's own tensors by name, ``(n, ...)`` each.
 
     Example:
@@ -41,12 +41,12 @@ class State:
     qvel: Tensor
     mocap_pos: Tensor | None = None
     mocap_quat: Tensor | None = None
-    steps: Tensor = None  # type: ignore[assignment]  # filled in __post_init__
+    time: Tensor = None  # type: ignore[assignment]  # filled in __post_init__
     variables: dict[str, Tensor] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.steps is None:
-            self.steps = torch.zeros(len(self.qpos), dtype=torch.int64)
+        if self.time is None:
+            self.time = torch.zeros(len(self.qpos), dtype=torch.float64)
 
     def __len__(self) -> int:
         return len(self.qpos)
@@ -65,7 +65,7 @@ class State:
             qvel=function(self.qvel),
             mocap_pos=None if self.mocap_pos is None else function(self.mocap_pos),
             mocap_quat=None if self.mocap_quat is None else function(self.mocap_quat),
-            steps=function(self.steps),
+            time=function(self.time),
             variables={name: function(x) for name, x in self.variables.items()},
         )
 
@@ -90,6 +90,6 @@ def concatenate(states: list[State]) -> State:
         qvel=torch.cat([s.qvel for s in states]),
         mocap_pos=join([s.mocap_pos for s in states]),
         mocap_quat=join([s.mocap_quat for s in states]),
-        steps=torch.cat([s.steps for s in states]),
+        time=torch.cat([s.time for s in states]),
         variables={k: torch.cat([s.variables[k] for s in states]) for k in first.variables},
     )

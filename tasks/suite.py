@@ -40,6 +40,8 @@ class SuiteTask(control.Task):
         self.description = description
         self._generator = torch.Generator().manual_seed(int(random.randint(2**31)))
         self._state: State | None = None
+        self._fresh = True
+        self._reward = 0.0
         self._action = torch.zeros(1, description.action_size, dtype=torch.float64)
 
     @property
@@ -59,21 +61,23 @@ class SuiteTask(control.Task):
         else:
             start = self.description.restart(self._state, self._generator)
         self._state = start.clone()
-        data = physics.data
-        data.qpos[:], data.qvel[:] = start.qpos[0].numpy(), start.qvel[0].numpy()
-        if start.mocap_pos is not None:
-            data.mocap_pos[:] = start.mocap_pos[0].numpy()
-        if start.mocap_quat is not None:
-            data.mocap_quat[:] = start.mocap_quat[0].numpy()
+        self._fresh = True
+        physics.data.time = float(start.time)
+        for field in ("qpos", "qvel", "mocap_pos", "mocap_quat"):
+            value = getattr(start, field)
+            if value is not None:
+                getattr(physics.data, field)[:] = value[0].numpy()
 
     def before_step(self, action: np.ndarray, physics: mujoco.Physics) -> None:
+        if self._fresh:  # dm_control's reset ran the solver; a batched row starts without memory
+            physics.data.qacc_warmstart[:] = 0.0
+            self._fresh = False
         self._action = torch.as_tensor(np.asarray(action, dtype=np.float64)).reshape(1, -1)
         ctrl = self.description.control(self._action, self._current(physics))
         physics.set_control(ctrl[0].numpy())
 
     def after_step(self, physics: mujoco.Physics) -> None:
         state = self._current(physics)
-        state.steps += 1
         self._reward = float(self.description.reward(state, self._action))
         state.variables |= self.description.update(state, self._action)
 
@@ -86,7 +90,8 @@ class SuiteTask(control.Task):
         return collections.OrderedDict(observation=observation.to(torch.float64).numpy())
 
     def get_termination(self, physics: mujoco.Physics) -> Any:
-        over = bool(self.description.terminated(self._current(physics)))
+        terminated = self.description.terminated(self._current(physics))
+        over = terminated is not None and bool(terminated)
         return 0.0 if over else None  # the discount of an episode that ends here
 
     def action_spec(self, physics: mujoco.Physics) -> Any:
@@ -94,15 +99,15 @@ class SuiteTask(control.Task):
 
     def _current(self, physics: mujoco.Physics) -> State:
         """The state with the physics' present positions and velocities."""
-        if self._state is None:  # asked for a spec before the first reset
-            self._state = self.description.sample_initial_state(1, torch.Generator())
-        self._state.qpos = _row(physics.data.qpos)
-        self._state.qvel = _row(physics.data.qvel)
-        if self._state.mocap_pos is not None:
-            self._state.mocap_pos = _row(physics.data.mocap_pos)
-        if self._state.mocap_quat is not None:
-            self._state.mocap_quat = _row(physics.data.mocap_quat)
-        return self._state
+        state = self._state
+        if state is None:  # asked for a spec before the first reset
+            state = self.description.sample_initial_state(1, torch.Generator())
+        state.qpos = _row(physics.data.qpos)
+        state.qvel = _row(physics.data.qvel)
+        state.time = _row(physics.data.time)
+        state.mocap_pos = _row(physics.data.mocap_pos)
+        state.mocap_quat = _row(physics.data.mocap_quat)
+        return state
 
 
 def _row(values: np.ndarray) -> Tensor:
@@ -134,6 +139,8 @@ def load(
     return control.Environment(
         physics,
         SuiteTask(description, random),
-        time_limit=description.max_steps * description.control_timestep,
+        # Half a step less: dm_control compares a step count with a quotient of floats.
+        time_limit=(description.max_steps - 0.5) * description.control_timestep,
         n_sub_steps=description.substeps,
+        legacy_step=False,  # mj_step as in the batch, not dm_control's split into two halves
     )
