@@ -15,7 +15,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
-from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 
@@ -235,22 +235,23 @@ class Symmetry(nn.Module):
             KeyError: an observation or action of the environment is not declared (strict).
             ValueError: a size differs, or a box is not symmetric; the message names key and entry.
         """
-        specs = Composite(shape=env.batch_size)
-        specs.update(env.observation_spec)
-        specs.update(env.full_action_spec)
-        for key, spec in specs.items(include_nested=True, leaves_only=True):
-            representation = self._resolve(key)
-            if representation is None:
-                continue
-            if not spec.shape or spec.shape[-1] != representation.dim:
-                raise ValueError(
-                    f"{key!r}: the environment has shape {tuple(spec.shape)}, expected a last dimension "
-                    f"of {representation.dim}"
-                )
-            _check_box(key, spec, representation)
+        for specs in (env.observation_spec, env.full_action_spec):
+            for key, spec in specs.items(include_nested=True, leaves_only=True):
+                representation = self._resolve(key)
+                if representation is not None:
+                    _check_size(key, spec, representation)
+                    _check_box(key, spec, representation)
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self._keys}"
+
+
+def _check_size(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
+    if not spec.shape or spec.shape[-1] != representation.dim:
+        raise ValueError(
+            f"{key!r}: the environment has shape {tuple(spec.shape)}, expected a last dimension of "
+            f"{representation.dim}"
+        )
 
 
 def _check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
