@@ -127,6 +127,7 @@ def train(
                 data = naive(data)  # before GAE: also the advantage is that of the copies
             with torch.no_grad():
                 gae(data)
+            buffer.empty()  # the sampler keeps a permutation drawn ahead, which no checkpoint would have
             buffer.extend(data.select(*_batch_keys(actor, critic)).reshape(-1))
             metrics |= _learn(config, losses, buffer, optimizer, schedule, parameters)
             metrics["std"] = float(data["scale"][..., 0, :].mean())
@@ -300,8 +301,9 @@ def _resume(
     for name, part in parts.items():
         part.load_state_dict(checkpoint["parts"][name])
     episodes.load_state_dict(checkpoint["episodes"])
-    if checkpoint["env"] is not None:
-        env.restore_state(checkpoint["env"])  # pyright: ignore[reportAttributeAccessIssue]
+    restore_env = getattr(env, "restore_state", None)
+    if restore_env is not None:
+        restore_env(checkpoint["env"])
     torch.set_rng_state(checkpoint["rng"])
     run.truncate(checkpoint["iteration"])
     return checkpoint["iteration"], checkpoint["seconds"]
