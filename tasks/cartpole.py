@@ -82,7 +82,7 @@ class CartPole(Task):
 
     def control(self, action: Tensor, state: State) -> Tensor:
         """Desired cart velocity, m/s."""
-        return action.clamp(-1.0, 1.0) * MAX_CART_VELOCITY
+        return action.clamp(-1.0, 1.0).mul_(MAX_CART_VELOCITY)
 
     def observe(self, state: State) -> Tensor:
         """Cart velocity, pole angle and pole velocity, each over its scale.
@@ -96,7 +96,7 @@ class CartPole(Task):
 
     def reward(self, state: State, action: Tensor) -> Tensor:
         """Minus the pole's distance from upright, over the time of the step, rad s."""
-        return _angle(state).abs_().mul_(-self.control_timestep)
+        return _angle(state).abs().mul_(-self.control_timestep)
 
     def transform_state(self, state: State, g: Element) -> State:
         """Mirror cart and pole."""
@@ -105,7 +105,11 @@ class CartPole(Task):
 
 
 def _angle(state: State) -> Tensor:
-    """Pole angle from upright, in [-pi, pi], rad; odd in floating-point arithmetic (see above)."""
-    angle = state.qpos[:, 1]
+    """Pole angle from upright, in [-pi, pi], rad."""
+    return state.shared("angle", lambda: _wrap(state.qpos[:, 1]))
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    """Same angle in [-pi, pi]; an odd function in floating-point arithmetic too (see above)."""
     turns = (angle * (0.5 / math.pi)).round_()
     return angle.sub(turns, alpha=2 * math.pi)

@@ -130,7 +130,9 @@ class BatchedEnv(EnvBase):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         self._restored = False
         task, state, simulation = self.task, self._state, self.simulation
-        action = tensordict.get("action").detach().cpu()
+        action = tensordict.get("action")
+        if action.requires_grad or not action.is_cpu:
+            action = action.detach().cpu()
         active = tensordict.get("_step", None)  # TorchRL skips rows that are done in some rollouts
         if active is not None:
             active = active.reshape(-1).cpu()
@@ -139,6 +141,7 @@ class BatchedEnv(EnvBase):
             diverged = simulation.diverged()
             self.num_diverged += int(diverged.sum())
             action = action.masked_fill(diverged[:, None], 0.0)
+        state.hold()
         reward = task.reward(state, action)
         for name, value in task.update(state, action).items():
             rows = slice(None) if active is None else active
@@ -150,12 +153,16 @@ class BatchedEnv(EnvBase):
         if diverged is not None:
             reward = reward.masked_fill(diverged, 0.0)
             terminated = terminated | diverged
-        over = terminated | truncated
-        self._over = over if active is None else torch.where(active, over, self._over)
+        if active is None:
+            torch.logical_or(terminated, truncated, out=self._over)
+        else:
+            self._over[active] = (terminated | truncated)[active]
+        observation = task.observe(state)
+        state.release()
         return self._output(
-            observation=task.observe(state).to(torch.float32),
+            observation=observation.to(torch.float32),
             reward=reward.to(torch.float32).unsqueeze(-1),
-            done=over.unsqueeze(-1).clone(),
+            done=self._over.unsqueeze(-1).clone(),
             terminated=terminated.unsqueeze(-1),
             truncated=truncated.unsqueeze(-1),
         )
@@ -171,7 +178,7 @@ class BatchedEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.ones_like(self._over) if mask is None else mask.reshape(-1).cpu()
         if self._restored and bool(rows.all()):
-            rows = self._over  # continue: only episodes that had ended when saved begin anew
+            rows = self._over.clone()  # continue: only episodes that had ended when saved begin anew
         self._restored = False
         ids = rows.nonzero().squeeze(-1)
         if len(ids):
@@ -222,6 +229,7 @@ class BatchedEnv(EnvBase):
 
     def _first_output(self) -> TensorDict:
         flags = torch.zeros(3, *self.batch_size, 1, dtype=torch.bool)
+        self._state.release()
         return self._output(
             observation=self.task.observe(self._state).to(torch.float32),
             done=flags[0],

@@ -43,10 +43,32 @@ class State:
     mocap_quat: Tensor | None = None
     time: Tensor = None  # type: ignore[assignment]  # filled in __post_init__
     variables: dict[str, Tensor] = field(default_factory=dict)
+    _memo: dict[str, Tensor] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         if self.time is None:
             self.time = torch.zeros(len(self.qpos), dtype=torch.float64)
+
+    def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
+        """A quantity that reward, termination and observation of one step all need.
+
+        Within a step of the batched environment it is computed once; elsewhere, every time. It must
+        depend on positions and velocities only, since variables change in the middle of a step, and
+        nobody may write into it.
+        """
+        if self._memo is None:
+            return compute()
+        if name not in self._memo:
+            self._memo[name] = compute()
+        return self._memo[name]
+
+    def hold(self) -> None:
+        """Keep what :meth:`shared` computes from now on; positions must not change any more."""
+        self._memo = {}
+
+    def release(self) -> None:
+        """Forget what :meth:`shared` kept; positions may change."""
+        self._memo = None
 
     def __len__(self) -> int:
         return len(self.qpos)
