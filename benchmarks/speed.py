@@ -1,0 +1,344 @@
+"""How fast the hot paths are, as ratios to what they could be at best, measured side by side.
+
+    python benchmarks/speed.py            # all, a few minutes on two cores
+    python benchmarks/speed.py --only env
+
+Every table compares our code with its limit in one run: environments with raw physics, losses with plain
+ClipPPOLoss and with bare torch of the same arithmetic, augmentation with a copy of memory. The variants of
+a row are timed in turn, round by round, so that a machine that slows down slows all of them; a figure is
+the median over rounds, a ratio the median of the rounds' ratios. One torch thread.
+"""
+
+import functools
+import json
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Literal
+
+import mujoco
+import numpy as np
+import tensordict
+import torch
+import torchrl
+import tyro
+from mujoco.batch import Batch
+from tensordict import TensorDict
+from tensordict.nn import AddStateIndependentNormalScale, TensorDictModule
+from torch import nn
+from torchrl.envs import EnvBase, ParallelEnv
+from torchrl.envs.libs.dm_control import DMControlWrapper
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss
+
+import tasks
+from torchrl_sym import PointGroup, SymmetricClipPPOLoss, Symmetry, SymmetryAugment
+from torchrl_sym.representations import axial, polar, signed_permutation
+
+OBSERVATION, ACTION = 48, 12  # a quadruped's proprioception and joints
+LOSS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01, "critic_coeff": 1.0, "loss_critic_type": "l2"}
+
+
+@dataclass
+class Arguments:
+    """Measure and print ratios."""
+
+    only: Literal["env", "loss", "augment"] | None = None
+    """One of the tables."""
+    rounds: int = 15
+    """Timed rounds per row."""
+    threads: int = 2
+    """Physics threads."""
+    num_envs: tuple[int, ...] = (64, 512, 2048)
+    """Sizes of the batched environment."""
+    rows: tuple[int, ...] = (256, 4096, 16384)
+    """Minibatch sizes of losses and augmentation."""
+    output: Path | None = Path(__file__).parent / "results" / "speed.json"
+    """Where the figures go."""
+
+
+def interleave(variants: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
+    """Seconds of each variant, round by round, after two rounds of warm-up."""
+    seconds: dict[str, list[float]] = {name: [] for name in variants}
+    for round_ in range(rounds + 2):
+        for name, run in variants.items():
+            start = time.perf_counter()
+            run()
+            if round_ >= 2:
+                seconds[name].append(time.perf_counter() - start)
+    return seconds
+
+
+def ratio(seconds: dict[str, list[float]], a: str, b: str) -> float:
+    """Median over the rounds of time a over time b."""
+    return median(x / y for x, y in zip(seconds[a], seconds[b], strict=True))
+
+
+def show(table: list[dict]) -> None:
+    """Print the last row of a table, under its header if it is the first."""
+    widths = {key: max(len(key), 9) for key in table[-1]}
+    if len(table) == 1:
+        print("  ".join(f"{key:>{width}s}" for key, width in widths.items()))
+    cells = (
+        f"{v:,.0f}"
+        if isinstance(v, float) and v >= 1000
+        else f"{v:.4g}"
+        if isinstance(v, float)
+        else str(v)
+        for v in table[-1].values()
+    )
+    print("  ".join(f"{cell:>{width}s}" for cell, width in zip(cells, widths.values(), strict=True)))
+
+
+# --- environments
+
+
+def measure_envs(arguments: Arguments) -> list[dict]:
+    """Env steps per second, resets included, against raw physics and against TorchRL's processes."""
+    print(f"\nenvironment steps per second, {arguments.threads} physics threads")
+    rows = []
+    for task in tasks.ALL_TASKS:
+        parallel = parallel_env_rate(task, arguments.rounds)
+        for n in arguments.num_envs:
+            steps = max(4, 8192 // n)
+            env = tasks.make_env(task, num_envs=n, num_threads=arguments.threads, seed=0)
+            variants = {"raw": raw_physics(env, steps, arguments.threads), "env": stepping(env, steps)}
+            seconds = interleave(variants, arguments.rounds)
+            rate = {name: n * steps / median(values) for name, values in seconds.items()}
+            row = {
+                "task": task,
+                "num_envs": n,
+                "raw_per_second": rate["raw"],
+                "env_per_second": rate["env"],
+                "env_over_raw": ratio(seconds, "raw", "env"),
+                "parallel_per_second": parallel,
+                "env_over_parallel": rate["env"] / parallel,
+            }
+            rows.append(row)
+            show(rows)
+    return rows
+
+
+def stepping(env: EnvBase, steps: int) -> Callable[[], None]:
+    """Steps with uniform random actions, and automatic resets, as a collector makes them."""
+    state = env.reset()
+    actions = 2 * torch.rand(steps, *env.action_spec.shape) - 1
+
+    def run() -> None:
+        nonlocal state
+        for action in actions:
+            _, state = env.step_and_maybe_reset(state.set("action", action))
+
+    return run
+
+
+def raw_physics(env: EnvBase, steps: int, threads: int) -> Callable[[], None]:
+    """The same model from the same starts under the same controls, with nothing around it."""
+    env.reset()
+    simulation = Batch(env.task.model, env.batch_size[0], threads)
+    qpos, qvel, ctrl = (simulation.bind(name) for name in ("qpos", "qvel", "ctrl"))
+    start = env.state
+    actions = 2 * torch.rand(steps, *env.action_spec.shape) - 1
+    controls = [env.task.control(action, start).double().numpy() for action in actions]
+
+    def run() -> None:
+        qpos[:], qvel[:] = start.qpos.numpy(), start.qvel.numpy()
+        for control in controls:
+            ctrl[:] = control
+            simulation.step(nstep=env.task.substeps)
+
+    return run
+
+
+def dm_control_face(task: str) -> EnvBase:
+    return DMControlWrapper(tasks.load(task))
+
+
+def parallel_env_rate(task: str, rounds: int, steps: int = 100) -> float:
+    """Steps per second of two processes, each with the dm_control face of the task."""
+    env = ParallelEnv(2, functools.partial(dm_control_face, task), mp_start_method="spawn")
+    try:
+        env.reset()
+        run = stepping(env, steps)
+        return 2 * steps / median(interleave({"parallel": run}, min(rounds, 7))["parallel"])
+    finally:
+        env.close()
+
+
+# --- losses
+
+
+def measure_losses(arguments: Arguments) -> list[dict]:
+    """One update (loss, backward, Adam) against ClipPPOLoss on as many rows, and against bare torch."""
+    print("\nmilliseconds per update of a 3 x 128 actor and critic, 48 observations, 12 actions")
+    groups = {1: PointGroup.trivial(), 2: PointGroup.reflection("y"), 4: PointGroup.klein_four()}
+    table = []
+    for rows in arguments.rows:
+        for n, group in groups.items():
+            symmetry = quadruped(group)
+            batch = random_batch(rows)
+            augmented = SymmetryAugment(symmetry)(batch)
+            for elements in ("all", "random"):
+                data = augmented if elements == "all" else batch  # as many rows for the others
+                variants = {
+                    "symmetric": update(batch, SymmetricClipPPOLoss, symmetry=symmetry, elements=elements),
+                    "clip_ppo": update(data, ClipPPOLoss),
+                    "bare": bare_update(data),
+                }
+                rounds = arguments.rounds if rows * n < 20000 else max(3, arguments.rounds // 3)
+                seconds = interleave(variants, rounds)
+                row = {
+                    "rows": rows,
+                    "order": n,
+                    "elements": elements,
+                    **{f"{name}_ms": 1e3 * median(values) for name, values in seconds.items()},
+                    "over_clip_ppo": ratio(seconds, "symmetric", "clip_ppo"),
+                    "over_bare": ratio(seconds, "symmetric", "bare"),
+                }
+                table.append(row)
+                show(table)
+    return table
+
+
+def quadruped(group: PointGroup) -> Symmetry:
+    """Four vectors and three frames of twelve joints, mirrored as ANYmal's are."""
+    legs = {"reflect-x": "FH", "reflect-y": "LR"}
+    flipped = {"reflect-x": ("HFE", "KFE"), "reflect-y": ("HAA",)}
+    names = [f"{leg}_{joint}" for leg in ("LF", "RF", "LH", "RH") for joint in ("HAA", "HFE", "KFE")]
+    maps = {}
+    for element in {"reflect-x", "reflect-y"} & set(group.names):
+        swap = str.maketrans(legs[element], legs[element][::-1])
+        maps[element] = {
+            name: ("-" if name.endswith(flipped[element]) else "") + name[:2].translate(swap) + name[2:]
+            for name in names
+        }
+    joints = signed_permutation(group, names, maps)
+    observation = polar(group) + axial(group) + polar(group) + polar(group) + joints * 3
+    return Symmetry(group, {"observation": observation, "action": joints})
+
+
+def random_batch(rows: int) -> TensorDict:
+    torch.manual_seed(0)
+    return TensorDict(
+        observation=torch.randn(rows, OBSERVATION),
+        action=torch.randn(rows, ACTION),
+        action_log_prob=-17 - torch.rand(rows),
+        advantage=torch.randn(rows, 1),
+        value_target=torch.randn(rows, 1),
+        batch_size=[rows],
+    )
+
+
+def networks() -> tuple[nn.Sequential, nn.Sequential]:
+    torch.manual_seed(0)
+    sizes = {"num_cells": [128, 128, 128], "activation_class": nn.ELU}
+    return MLP(OBSERVATION, ACTION, **sizes), MLP(OBSERVATION, 1, **sizes)
+
+
+def update(batch: TensorDict, loss_class: type[ClipPPOLoss], **kwargs) -> Callable[[], None]:
+    policy, value = networks()
+    head = nn.Sequential(policy, AddStateIndependentNormalScale(ACTION))
+    actor = ProbabilisticActor(
+        TensorDictModule(head, in_keys=["observation"], out_keys=["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    critic = ValueOperator(value, in_keys=["observation"])
+    loss = loss_class(actor, critic, **LOSS, **kwargs)
+    optimizer = torch.optim.Adam([*actor.parameters(), *critic.parameters()], lr=1e-4)
+
+    def run() -> None:
+        out = loss(batch)
+        optimizer.zero_grad()
+        (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
+        optimizer.step()
+
+    return run
+
+
+def bare_update(batch: TensorDict) -> Callable[[], None]:
+    """The arithmetic of ClipPPOLoss and nothing else."""
+    policy, value = networks()
+    log_std = nn.Parameter(torch.zeros(ACTION))
+    optimizer = torch.optim.Adam([*policy.parameters(), *value.parameters(), log_std], lr=1e-4)
+    observation, action, log_prob_old, advantage, target = (
+        batch[key] for key in ("observation", "action", "action_log_prob", "advantage", "value_target")
+    )
+    advantage = advantage.squeeze(-1)
+    low, high = np.log1p(-LOSS["clip_epsilon"]), np.log1p(LOSS["clip_epsilon"])
+    log_two_pi = ACTION * np.log(2 * np.pi)
+
+    def run() -> None:
+        z = (action - policy(observation)) / log_std.exp()
+        log_prob = -0.5 * (z.square().sum(-1) + log_two_pi) - log_std.sum()
+        log_ratio = log_prob - log_prob_old
+        gain = torch.minimum(log_ratio.exp() * advantage, log_ratio.clamp(low, high).exp() * advantage)
+        entropy = log_std.sum() + 0.5 * (ACTION + log_two_pi)
+        loss_critic = (value(observation) - target).square().mean()
+        optimizer.zero_grad()
+        (loss_critic - gain.mean() - LOSS["entropy_coeff"] * entropy).backward()
+        optimizer.step()
+
+    return run
+
+
+# --- augmentation
+
+
+def measure_augmentation(arguments: Arguments) -> list[dict]:
+    """SymmetryAugment with four elements, against copying as many bytes."""
+    print("\nmilliseconds per augmented batch, N = 4, 48 observations, 12 actions")
+    symmetry = quadruped(PointGroup.klein_four())
+    table = []
+    for rows in arguments.rows:
+        batch = random_batch(rows)
+        for elements in ("all", "random"):
+            augment = SymmetryAugment(symmetry, elements=elements)
+            result = augment(batch)
+            variants = {"augment": lambda: augment(batch), "copy": result.clone}  # noqa: B023
+            seconds = interleave(variants, 3 * arguments.rounds)
+            row = {
+                "rows": rows,
+                "elements": elements,
+                **{f"{name}_ms": 1e3 * median(values) for name, values in seconds.items()},
+                "over_copy": ratio(seconds, "augment", "copy"),
+            }
+            table.append(row)
+            show(table)
+    return table
+
+
+def main(arguments: Arguments) -> None:
+    torch.set_num_threads(1)
+    tables = {"env": measure_envs, "loss": measure_losses, "augment": measure_augmentation}
+    results = {
+        name: measure(arguments)
+        for name, measure in tables.items()
+        if arguments.only is None or arguments.only == name
+    }
+    results["versions"] = {
+        "python": platform.python_version(),
+        **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
+    }
+    results["machine"] = {"processor": processor(), "physics_threads": arguments.threads}
+    if arguments.output is not None:
+        kept = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(json.dumps(kept | results, indent=2) + "\n")
+        print(f"\nwritten to {arguments.output}")
+
+
+def processor() -> str:
+    """Model name of the processor, as far as the system tells."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    return f"{len(names)} x {names[0]}" if names else platform.processor()
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
