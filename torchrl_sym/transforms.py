@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -130,13 +130,8 @@ class SymmetryAugment(Transform):
                 "instead of add, or when='sample'"
             )
         out = self.augment(tensordict)
-        capacity = getattr(getattr(buffer, "_storage", None), "max_size", None)
-        if capacity is not None and out.numel() > capacity:
-            raise RuntimeError(
-                f"the storage holds {capacity} rows, but {tensordict.numel()} rows and their symmetric "
-                f"copies are {out.numel()} and would overwrite each other; make the storage "
-                f"{len(self.elements)} times as large, or use when='sample'"
-            )
+        if buffer is not None and not self.random:
+            self._check_extending(buffer, tensordict, out)
         return out
 
     def augment(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -157,11 +152,13 @@ class SymmetryAugment(Transform):
         if self.random:
             return self._augment_random(td)
         orbit = self.symmetry.orbit(td, self.elements)
-        self._reevaluate(orbit[1:])
+        self._reevaluate(orbit, originals=1)
         self._separate_trajectories(orbit)
         names = td.names if td._has_names() else None
         if self.layout == "stack":
-            out = orbit.permute(*range(1, orbit.batch_dims), 0)
+            out = orbit
+            for dim in range(td.batch_dims):  # permute, in steps that torch.compile can follow
+                out = out.transpose(dim, dim + 1)
             if names is not None:
                 out.names = [*names, None]
             return out
@@ -173,17 +170,19 @@ class SymmetryAugment(Transform):
     def _augment_random(self, td: TensorDictBase) -> TensorDictBase:
         n = self.symmetry.group.order
         out = self.symmetry(td, torch.randint(n, td.batch_size, device=td.device))
-        self._reevaluate(out)
+        self._reevaluate(out, originals=0)
         return out
 
-    def _reevaluate(self, copies: TensorDictBase) -> None:
+    def _reevaluate(self, batch: TensorDictBase, originals: int) -> None:
         actor = self.__dict__["log_prob_from"]
-        if actor is None or copies.numel() == 0:
+        if actor is None or len(batch) == originals:
             return
+        copies = cast(TensorDictBase, batch[originals:])
         with torch.no_grad():
             state = copies.select(*actor.in_keys, *actor.dist_sample_keys)
             log_prob = actor.get_dist(state).log_prob(state.get(actor.dist_sample_keys[0]))
-        copies.set_(actor.log_prob_keys[0], log_prob)
+        key = actor.log_prob_keys[0]  # set, not written in place: the copies share the original's memory
+        batch.set(key, torch.cat([batch.get(key)[:originals], log_prob]))
 
     def _separate_trajectories(self, orbit: TensorDictBase) -> None:
         """Copies are trajectories of their own: slices must not run from one into the next."""
@@ -204,6 +203,27 @@ class SymmetryAugment(Transform):
                 f"the batch lacks {missing}, which the symmetry declares; it has "
                 f"{sorted(map(str, present))}; rename the symmetry's key, or pass select=[...]"
             )
+
+    def _check_extending(
+        self, buffer: ReplayBuffer, tensordict: TensorDictBase, out: TensorDictBase
+    ) -> None:
+        storage, sampler = buffer._storage, buffer._sampler
+        dims = getattr(storage, "ndim", 1)  # a record is what lies behind these dimensions
+        before, after = (td.batch_size[:dims].numel() for td in (tensordict, out))
+        if after > storage.max_size:
+            raise RuntimeError(
+                f"the storage holds {storage.max_size} rows, but {before} rows and their symmetric copies "
+                f"are {after} and would overwrite each other; make the storage {len(self.elements)} times "
+                "as large, or use when='sample'"
+            )
+        if self.layout == "cat" and isinstance(sampler, SliceSampler):
+            automatic = getattr(sampler, "_traj_key_auto", False)  # looks for our key first
+            if _TRAJECTORY not in out.keys(True) or not (automatic or sampler.traj_key == _TRAJECTORY):
+                raise RuntimeError(
+                    f"a slice could run from one symmetric copy into the next: only {_TRAJECTORY} tells "
+                    "the copies apart, and the batch lacks it or the sampler does not cut by it; keep the "
+                    "collector's trajectory ids and the sampler's default keys, or use when='sample'"
+                )
 
     def _check_sampling(self, caller: tuple[ReplayBuffer | None, str]) -> None:
         buffer, _ = caller
@@ -309,6 +329,8 @@ class _OrbitTransform(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.batch_dims == 0:
             return tensordict
+        if not torch.compiler.is_compiling() and _calling_buffer()[1] == "__getitem__":
+            return tensordict  # buffer[4:8] reads rows as they are stored, without the sample unit
         rows, n = tensordict.batch_size[0], len(self.elements)
         if rows % n:
             raise RuntimeError(
