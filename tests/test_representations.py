@@ -142,6 +142,16 @@ def test_gradient_is_the_transpose(name, group):
     assert_close(x.grad, torch.einsum("gbi,gij->bj", cotangent, rep.matrices))
 
 
+@pytest.mark.parametrize(
+    "group, generators", [("D3", ["rot-120", "reflect-y"]), ("D4", ["rot-90", "reflect-45"])]
+)
+def test_maps_of_generators_determine_the_rest(group, generators):
+    g = GROUPS[group]
+    maps = {name: translations(g, signed=True)[name] for name in generators}
+    rep = signed_permutation(g, g.names, maps)
+    assert torch.equal(rep.matrices, build("signed_permutation", group).matrices)
+
+
 # --- algebra
 
 
