@@ -148,7 +148,7 @@ class MirrorLoss(LossModule):
         network, keys = self.actor_network, self.tensor_keys
         written = network.out_keys
         if hasattr(network, "dist_sample_keys"):
-            self.set_keys(action=network.dist_sample_keys[0])
+            self.set_keys(action=single_action(network))
         elif keys.action not in written and keys.value not in written:
             declared = set(self.symmetry.keys()) & set(written) - set(network.in_keys)
             if len(declared) == 1:
@@ -206,6 +206,18 @@ class MirrorLoss(LossModule):
         )
         self._clear_weakrefs(td_out, "actor_network_params", "target_actor_network_params")
         return td_out
+
+
+def single_action(actor: TensorDictModule) -> NestedKey:
+    """Key of the action that a probabilistic actor samples.
+
+    Raises:
+        ValueError: the actor has several action heads, for which no distance is defined.
+    """
+    keys = actor.dist_sample_keys
+    if len(keys) != 1:
+        raise ValueError(f"the mirror loss compares one action, got an actor with {keys}; join its heads")
+    return keys[0]
 
 
 def deterministic_action(dist: torch.distributions.Distribution) -> Tensor:

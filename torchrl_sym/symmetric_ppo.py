@@ -15,6 +15,7 @@ import contextlib
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.ppo import (
@@ -22,7 +23,7 @@ from torchrl.objectives.ppo import (
     _check_advantage_broadcast,
 )
 
-from torchrl_sym.mirror_loss import batched, deterministic_action, squared_distance
+from torchrl_sym.mirror_loss import batched, deterministic_action, single_action, squared_distance
 from torchrl_sym.symmetry import Elements, Symmetry
 
 
@@ -109,6 +110,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         self._mirrors = mirror_coeff > 0
         if self._mirrors:
             self.register_coeff_buffer("mirror_coeff", mirror_coeff)
+            single_action(self.actor_network)
         self._require_keys()
 
     _schedulable_buffers = ClipPPOLoss._schedulable_buffers | {"mirror_coeff"}
@@ -120,9 +122,8 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             self._require_keys()
 
     def _require_keys(self) -> None:
-        self.symmetry.require(self.actor_network.in_keys, "the actor")
-        if self.critic_network is not None:
-            self.symmetry.require(self.critic_network.in_keys, "the critic")
+        self.symmetry.require(_inputs(self.actor_network), "the actor")
+        self.symmetry.require(_inputs(self.critic_network), "the critic")
         self.symmetry.require(_as_list(self.tensor_keys.action), "the surrogate objective")
 
     @property
@@ -200,16 +201,15 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         advantage = self._maybe_normalize_advantage(advantage, td, update_norm=missing)
         td.set(self.tensor_keys.advantage, advantage)
 
+    def _mapped_keys(self) -> list[NestedKey]:
+        """What differs between symmetric copies; they share the rest of what the loss reads."""
+        networks = [*_inputs(self.actor_network), *_inputs(self.critic_network)]
+        return [*networks, *_as_list(self.tensor_keys.action)]
+
     def _read_keys(self) -> list[NestedKey]:
         keys = self.tensor_keys
-        critic = [] if self.critic_network is None else self.critic_network.in_keys
-        read = [
-            *self.actor_network.in_keys,
-            *critic,
-            *_as_list(keys.action),
-            *self._loss_mask_keys(),
-        ]
-        read += [*_as_list(keys.sample_log_prob), keys.advantage, keys.value_target]
+        read = [*self._mapped_keys(), *self._loss_mask_keys(), *_as_list(keys.sample_log_prob)]
+        read += [keys.advantage, keys.value_target]
         return read if self.clip_value is None else [*read, keys.value]
 
     def _report_entropy(self, td_out: TensorDictBase, entropy: Tensor | TensorDictBase) -> None:
@@ -227,11 +227,11 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         if self.random:  # each row is one term of the sum, drawn with probability 1/N
             with torch.no_grad():
                 label = act(deterministic_action(self._distribution(rows.td)), rows.element)
-            return len(self.elements) * squared_distance(output, label)
+            return len(self.elements) * squared_distance(output, label).unsqueeze(-1)
         output = output.unflatten(0, (len(self.elements), -1))
         with torch.no_grad():
             label = torch.stack([act(output[0], g) for g in self.elements])
-        return squared_distance(output, label).sum(0)
+        return squared_distance(output, label).sum(0).unsqueeze(-1)
 
     def _distribution(self, td: TensorDictBase) -> torch.distributions.Distribution:
         with (
@@ -255,11 +255,15 @@ class _Rows:
         self.td = td
         self.count = loss.symmetry.group.order if loss.random else len(loss.elements)
         self.element: Tensor | None = None
+        mapped, shared = td.select(*loss._mapped_keys()), td.exclude(*loss._mapped_keys())
         if loss.random:
-            self.element = torch.randint(self.count, td.batch_size, device=td.device)
-            self.expanded = loss.symmetry(td, self.element)
+            self.element = torch.zeros(td.batch_size, dtype=torch.long, device=td.device)
+            if self.count > 1:  # the trivial group leaves the stream of random numbers as it is
+                self.element = torch.randint(self.count, td.batch_size, device=td.device)
+            self.expanded = loss.symmetry(mapped, self.element).update(shared)
         else:
-            orbit = loss.symmetry.orbit(td, loss.elements)
+            orbit = loss.symmetry.orbit(mapped, loss.elements)
+            orbit.update(shared.expand(self.count, *td.batch_size))
             self.expanded = orbit.reshape(-1, *td.batch_size[1:])
 
     def originals(self, x: Tensor | TensorDictBase):
@@ -310,3 +314,12 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
     if keys is None:
         return []
     return list(keys) if isinstance(keys, list) else [keys]
+
+
+def _inputs(network: TensorDictModule | None) -> list[NestedKey]:
+    """What a network reads from the batch; not the group of parameters that its own modules fill."""
+    if network is None:
+        return []
+    written = [key for key in network.out_keys if isinstance(key, tuple)]
+    filled = {unravel_key(key[:depth]) for key in written for depth in range(1, len(key))}
+    return [key for key in network.in_keys if unravel_key(key) not in filled]
