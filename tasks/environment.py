@@ -83,6 +83,7 @@ class BatchedEnv(EnvBase):
         self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
         self._started = False
         self._restored = False
+        self._stagger = False
         self.set_seed(seed if seed is not None else int(torch.randint(2**31, ())))
 
     @property
@@ -188,7 +189,27 @@ class BatchedEnv(EnvBase):
                 start = self.task.sample_initial_state(len(ids), self._generator)
             self._write(ids, start)
             self.task.randomize(self.simulation, ids, self._generator)
+        if self._stagger and len(ids) == len(rows):
+            self._stagger = False
+            steps = torch.randint(self.task.max_steps, rows.shape, generator=self._generator)
+            self._state.time[:] = steps * self.task.control_timestep
         return self._first_output()
+
+    def stagger(self) -> None:
+        """Start every row of the next full reset at a random time of its episode.
+
+        Otherwise episodes that end by time alone stay in step, every batch of a collector sees one
+        phase of the task, and on-policy learning forgets the others.
+
+        Example:
+            >>> import tasks
+            >>> env = tasks.make_env("cartpole", num_envs=64, num_threads=1, seed=0)
+            >>> env.stagger()
+            >>> start = env.reset()
+            >>> len(set(env.state.time.tolist())) > 32
+            True
+        """
+        self._stagger = True
 
     def reset_to(self, state: State) -> TensorDict:
         """Start an episode of every row from a given state, as for evaluation.

@@ -221,12 +221,23 @@ def test_symmetry_metrics_of_an_equivariant_policy(symmetry):
     assert metrics["log_prob"] == pytest.approx(metrics["log_prob_copies"], abs=1e-6)
 
 
-def test_episode_returns_cross_batches():
+def test_episode_returns_cross_batches_and_leave_out_the_first():
     env = MAKE_ENV(num_envs=2, seed=0)
     episodes = Episodes(env)
     data = env.rollout(4, break_when_any_done=False)
     data["next", "reward"][:] = 1.0
     data["next", "done"][:] = False
-    assert torch.tensor(episodes.update(data)).isnan()
     data["next", "done"][0, 1] = True
-    assert episodes.update(data) == 6.0
+    assert torch.tensor(episodes.update(data)).isnan()  # row 0 ended its first episode, row 1 nothing
+    assert episodes.update(data) == 4.0  # row 0 again: two steps of the last batch and two of this
+
+
+def test_training_starts_at_all_phases(symmetry):
+    made = []
+
+    def make_env(**kwargs):
+        made.append(MAKE_ENV(**kwargs))
+        return made[-1]
+
+    next(iter(train(dataclasses.replace(TINY, num_envs=64), make_env, symmetry)))
+    assert made[0].state.time.unique().numel() > 32

@@ -19,6 +19,8 @@ _MAX_ROWS = 2048  # rows on which the symmetry metrics are evaluated
 class Episodes:
     """Undiscounted returns of finished episodes, across iterations.
 
+    The first episode of every environment is left out: it may have started at a random time.
+
     Args:
         env: the environment whose batches will be seen; its batch size is the number of episodes
             that run side by side.
@@ -26,6 +28,7 @@ class Episodes:
 
     def __init__(self, env: EnvBase) -> None:
         self.running = torch.zeros(env.batch_size.numel())
+        self.whole = torch.zeros(len(self.running), dtype=torch.bool)  # past their first episode
         self.latest = math.nan
 
     def update(self, data: TensorDictBase) -> float:
@@ -36,20 +39,21 @@ class Episodes:
         finished = []
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
             self.running = self.running + reward
-            finished.append(self.running[done])
+            finished.append(self.running[done & self.whole])
             self.running = self.running.masked_fill(done, 0.0)
+            self.whole = self.whole | done
         returns = torch.cat(finished)
         if len(returns):
             self.latest = float(returns.mean())
         return self.latest
 
     def state_dict(self) -> dict[str, Any]:
-        """Returns of the running episodes and the last mean."""
-        return {"running": self.running.clone(), "latest": self.latest}
+        """Returns so far of the running episodes, which of them are whole, and the last mean."""
+        return {"running": self.running.clone(), "whole": self.whole.clone(), "latest": self.latest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from a stored state."""
-        self.running = state["running"].clone()
+        self.running, self.whole = state["running"].clone(), state["whole"].clone()
         self.latest = state["latest"]
 
 

@@ -54,7 +54,8 @@ def train(
 
     With a folder, the run can be killed at any time and continues when called again, exactly: on one
     thread the metrics are those of a run that was never interrupted. This needs an environment with
-    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have; others begin new episodes.
+    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have; others begin new episodes. If the
+    environment has ``stagger()``, it is called first, so that batches hold all phases of an episode.
 
     Args:
         config: hyper-parameters.
@@ -104,6 +105,8 @@ def train(
     run = None if folder is None else RunFolder(folder)
     parts = {"actor": actor, "critic": critic, "optimizer": optimizer}
     start, elapsed = _resume(run, config, env, parts, episodes)
+    if start == 0 and hasattr(env, "stagger"):
+        env.stagger()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
     if start >= config.iterations:
         return
     collector = Collector(
