@@ -252,6 +252,32 @@ def test_divergence_ends_one_episode_and_nothing_else(name, poison, tmp_path, mo
     assert env.num_diverged == 1
 
 
+class Falling(CartPole):
+    """Ends with reward 7 where the pole comes close to hanging; 1 for every other step."""
+
+    def reward(self, state, action):
+        return torch.where(self.terminated(state), 7.0, 1.0)
+
+    def terminated(self, state):
+        return self.observe(state)[:, 1].abs() > 0.75
+
+
+def test_a_diverged_row_earns_nothing():
+    env = BatchedEnv(Falling(), 3, num_threads=1, seed=0)
+    td = env.reset().set("action", torch.tensor([[0.0], [torch.nan], [0.0]]))
+    assert env.step(td)["next", "reward"].squeeze(-1).tolist() == [1.0, 0.0, 1.0]
+
+
+def test_termination_is_not_truncation():
+    env = BatchedEnv(Falling(), 4, num_threads=1, seed=0)
+    batch = play(env, env.reset(), torch.zeros(60, 4, 1))["next"]
+    ended = batch["reward"] == 7
+    assert ended.any()
+    assert torch.equal(batch["terminated"], ended)
+    assert torch.equal(batch["done"], ended)
+    assert not batch["truncated"].any()
+
+
 # -- saving -----------------------------------------------------------------------------------------
 
 
@@ -303,7 +329,8 @@ def _linear_policy(env):
 
 
 @all_tasks
-def test_collector_on_a_restored_environment_continues(name):
+@pytest.mark.parametrize("seconds", [0.5, 0.6], ids=["mid-episode", "at the end of an episode"])
+def test_collector_on_a_restored_environment_continues(name, seconds):
     def collector(env):
         return Collector(
             env,
@@ -317,13 +344,13 @@ def test_collector_on_a_restored_environment_continues(name):
     def content(batch):
         return batch.select("observation", "action", "next")
 
-    env = make(name, num_envs=5, episode_seconds=0.5)
+    env = make(name, num_envs=5, episode_seconds=seconds)
     whole = [content(batch.clone()) for batch in collector(env)]
 
-    env = make(name, num_envs=5, episode_seconds=0.5)
+    env = make(name, num_envs=5, episode_seconds=seconds)
     iterator = iter(collector(env))
     assert_same(content(next(iterator).clone()), whole[0])
-    other = make(name, num_envs=5, episode_seconds=0.5, seed=99)
+    other = make(name, num_envs=5, episode_seconds=seconds, seed=99)
     other.restore_state(env.save_state())
     assert_same(content(next(iter(collector(other))).clone()), whole[1])
 
@@ -553,6 +580,19 @@ def test_evaluation_by_hand():
     torch.testing.assert_close(result.returns[0], expected)
 
 
+def test_evaluation_stops_where_the_first_episode_ends():
+    policy = TensorDictModule(lambda x: torch.zeros_like(x[..., :1]), ["observation"], ["action"])
+    env = BatchedEnv(Falling(), 1, num_threads=1)
+    returns = evaluate(env, policy, episodes=30, num_threads=1).returns
+    start = env.task.sample_goal_state(30, torch.Generator().manual_seed(0))
+    env = BatchedEnv(env.task, 30, num_threads=1)
+    rollout = env.rollout(200, policy, tensordict=env.reset_to(start), auto_reset=False,
+                          break_when_any_done=False)  # fmt: skip
+    first_end = rollout["next", "done"].squeeze(-1).int().argmax(dim=1)
+    assert len(first_end.unique()) > 1
+    torch.testing.assert_close(returns[0], first_end.double() + 7)
+
+
 def test_evaluation_leaves_the_environment_and_the_random_numbers_alone():
     env = make("cartpole")
     env.rollout(3)
@@ -701,6 +741,32 @@ def test_variables_take_part_in_the_symmetry_check():
     task = Memory()
     task.randomize = lambda *args: None
     assert equivariance_error(task, task.symmetry, "reflect-x", steps=4) == 0.0
+
+
+class Feedback(CartPole):
+    """Drives the cart by a shared quantity, which changes with every step and every reset."""
+
+    def control(self, action, state):
+        return 3.0 * torch.sin(state.shared("angle", lambda: state.qpos[:, 1:] * 1.0))
+
+
+class PlainFeedback(CartPole):
+    def control(self, action, state):
+        return 3.0 * torch.sin(state.qpos[:, 1:])
+
+
+def test_shared_quantities_are_never_stale():
+    batches = []
+    for cls in (Feedback, PlainFeedback):
+        env = BatchedEnv(cls(episode_seconds=0.5), 5, num_threads=1, seed=0)
+        sequence = actions(env, 40)
+        first = play(env, stagger(env), sequence)
+        other = BatchedEnv(cls(episode_seconds=0.5), 5, num_threads=1)
+        play(other, other.reset(), sequence[:3])
+        other.restore_state(env.save_state())
+        last = first[-1]["next"].select("observation", "done", "terminated", "truncated")
+        batches.append(torch.cat([first, play(other, last, sequence)]))
+    assert_same(*batches)
 
 
 def test_states_are_joined_and_cut_with_their_variables():
