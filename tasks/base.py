@@ -144,7 +144,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def observe(self, state: State) -> Tensor:
-        """Observation, a new tensor of shape ``(n, observation_size)``."""
+        """Observation, a new tensor of shape ``(n, observation_size)``, float32 or float64."""
 
     @abc.abstractmethod
     def reward(self, state: State, action: Tensor) -> Tensor:

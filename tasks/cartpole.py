@@ -26,8 +26,10 @@ from torchrl_sym.representations import pseudoscalar
 
 # Desired cart velocity at full action, m/s. The paper gives no limit.
 MAX_CART_VELOCITY = 3.0
-# Scales of the observation (cart velocity m/s, pole angle rad, pole velocity rad/s): about 1 each.
-OBSERVATION_SCALE = (3.0, math.pi, 10.0)
+# What the observation is divided by, so that its entries are about 1: the velocities of cart (m/s)
+# and pole (rad/s), and the pole's angle (rad).
+VELOCITY_SCALE = (3.0, 10.0)
+ANGLE_SCALE = math.pi
 # The pole starts flat: angle from upright, rad.
 START_ANGLE = math.pi / 2
 # Half-width of the uniform noise on the start angle (rad) and on both velocities (m/s, rad/s).
@@ -70,7 +72,7 @@ class CartPole(Task):
         self.symmetry = Symmetry(
             group, {"observation": pseudoscalar(group) * 3, "action": pseudoscalar(group)}
         )
-        self._scale = torch.tensor(OBSERVATION_SCALE, dtype=torch.float64)
+        self._velocity_scale = torch.tensor(VELOCITY_SCALE, dtype=torch.float64)
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The pole lies flat to the right; noise on its angle and on both velocities."""
@@ -89,10 +91,10 @@ class CartPole(Task):
 
         The cart's position is left out: the rail has no end, so nothing depends on it.
         """
-        observation = state.qvel.new_empty(len(state), 3)
-        observation[:, ::2] = state.qvel
-        observation[:, 1] = _angle(state)
-        return observation.div_(self._scale)
+        observation = torch.empty(len(state), 3)
+        torch.div(state.qvel, self._velocity_scale, out=observation[:, ::2])
+        torch.div(_angle(state), ANGLE_SCALE, out=observation[:, 1])
+        return observation
 
     def reward(self, state: State, action: Tensor) -> Tensor:
         """Minus the pole's distance from upright, over the time of the step, rad s."""

@@ -105,7 +105,7 @@ class Simulation:
             )
         self.ctrl.copy_(ctrl)
         diverged = self._none_diverged
-        if not math.isfinite(float(self.ctrl.sum())):
+        if not math.isfinite(float(ctrl.sum())):
             diverged = ~self.ctrl.isfinite().all(dim=-1)
             self.ctrl[diverged] = 0.0
         try:
@@ -117,7 +117,7 @@ class Simulation:
         if self._diverged is self._none_diverged:
             return False
         self._park(self._diverged)
-        return True
+        return bool(self._diverged.any())
 
     def _any_lost(self) -> bool:
         """Whether any row may have diverged: two reductions, the only price of a healthy step.
