@@ -25,6 +25,7 @@ LAYERS = (
     "groups",
     "representations",
     "symmetry",
+    "rows",
     "transforms mirror_loss symmetric_ppo modules normalization mujoco testing",
     "recipes",
     "__init__",

@@ -196,7 +196,7 @@ class MirrorLoss(LossModule):
             output = self._output(orbit)
             label = act.orbit(output[0])
             label = label.detach() if self.stop_gradient else label
-            error = squared_distance(output, label)[-max(len(orbit) - 1, 1) :]
+            error = squared_distance(output, label)  # (N, *B), zero for the identity
         td_out = TensorDict(loss_mirror=self.coeff * error.sum(0))
         if self.per_element:
             per_element = error.detach().flatten(1).mean(1)

@@ -24,6 +24,7 @@ from torchrl.objectives.ppo import (
 )
 
 from torchrl_sym.mirror_loss import batched, deterministic_action, single_action, squared_distance
+from torchrl_sym.rows import Rows
 from torchrl_sym.symmetry import Elements, Symmetry
 
 
@@ -144,7 +145,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
         self._prepare_advantage(td)
         td = td.select(*self._read_keys(), strict=False)
-        rows = _Rows(self, td)
+        rows = Rows(self.symmetry, None if self.random else self.elements, td, self._mapped_keys())
         advantage = rows.expanded.get(self.tensor_keys.advantage)
 
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
@@ -220,7 +221,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         td_out.set("entropy", total.detach().mean())
         td_out.set("loss_entropy", self._weighted_loss_entropy(entropy))
 
-    def _mirror_error(self, rows: _Rows, dist: torch.distributions.Distribution) -> Tensor:
+    def _mirror_error(self, rows: Rows, dist: torch.distributions.Distribution) -> Tensor:
         """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
         act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
         output = deterministic_action(dist)  # pi(L_g s)
@@ -241,73 +242,11 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         ):
             return self.actor_network.get_dist(td)
 
-    def _reduce(self, name: str, value: Tensor, rows: _Rows) -> Tensor:
+    def _reduce(self, name: str, value: Tensor, rows: Rows) -> Tensor:
         if not name.startswith("loss_"):
             return value
         per_original = name in ("loss_entropy", "loss_mirror")
         return self._reduce_loss(value, rows.td if per_original else rows.expanded).squeeze(-1)
-
-
-class _Rows:
-    """The rows the loss works on: all copies, group-major, or one drawn copy per row."""
-
-    def __init__(self, loss: SymmetricClipPPOLoss, td: TensorDictBase) -> None:
-        self.td = td
-        self.count = loss.symmetry.group.order if loss.random else len(loss.elements)
-        self.element: Tensor | None = None
-        mapped, shared = td.select(*loss._mapped_keys()), td.exclude(*loss._mapped_keys())
-        if loss.random:
-            self.element = torch.zeros(td.batch_size, dtype=torch.long, device=td.device)
-            if self.count > 1:  # the trivial group leaves the stream of random numbers as it is
-                self.element = torch.randint(self.count, td.batch_size, device=td.device)
-            self.expanded = loss.symmetry(mapped, self.element).update(shared)
-        else:
-            orbit = loss.symmetry.orbit(mapped, loss.elements)
-            orbit.update(shared.expand(self.count, *td.batch_size))
-            self.expanded = orbit.reshape(-1, *td.batch_size[1:])
-
-    def originals(self, x: Tensor | TensorDictBase):
-        """Rows of the identity. With drawn elements: all rows, weighted so that the mean is theirs."""
-        if self.element is None:
-            return x[: len(x) // self.count]
-        drawn = (self.element == 0).to(torch.get_default_dtype())
-        return x * (drawn / drawn.mean().clamp_min(1 / drawn.numel())).unsqueeze(-1)
-
-    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
-        """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
-        log_ratio = log_ratio.detach().squeeze(-1)
-        own = self._own(log_ratio)
-        ess = (2 * own.logsumexp(0) - (2 * own).logsumexp(0)).exp()
-        td_out.set("clip_fraction", self.originals(clipped).mean())
-        td_out.set("kl_approx", self.originals(kl.detach()).mean())
-        td_out.set("ESS", (ess / own.isfinite().sum(0).clamp_min(1)).nan_to_num())
-        td_out.set("max_ratio", own.max().exp())
-        td_out.set("mean_ratio", self.originals(log_ratio.exp().unsqueeze(-1)).mean())
-        td_out.set("clip_fraction_sym", self._per_element(clipped.squeeze(-1)))
-        td_out.set("kl_approx_sym", self._per_element(kl.detach().squeeze(-1)))
-        td_out.set("ESS_sym", self._ess_per_element(log_ratio))
-
-    def _own(self, log_ratio: Tensor) -> Tensor:
-        if self.element is None:
-            return log_ratio[: len(log_ratio) // self.count]
-        return log_ratio.masked_fill(self.element != 0, -torch.inf)
-
-    def _membership(self, x: Tensor) -> Tensor:
-        """Which rows belong to which element, ``(N, rows)`` bool."""
-        index = torch.arange(self.count, device=x.device)
-        if self.element is None:
-            return index.repeat_interleave(x.numel() // self.count) == index[:, None]
-        return self.element.flatten() == index[:, None]
-
-    def _per_element(self, x: Tensor) -> Tensor:
-        member = self._membership(x).to(x.dtype)
-        return (member @ x.flatten()) / member.sum(1).clamp_min(1)
-
-    def _ess_per_element(self, log_ratio: Tensor) -> Tensor:
-        member = self._membership(log_ratio)
-        lw = torch.where(member, log_ratio.flatten(), -torch.inf)
-        ess = (2 * lw.logsumexp(1) - (2 * lw).logsumexp(1)).exp()
-        return (ess / member.sum(1).clamp_min(1)).nan_to_num()
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:

@@ -1,0 +1,96 @@
+"""The rows a symmetric loss works on, and which of them are the originals.
+
+A loss that sees symmetric copies must tell them apart from the samples of the rollout policy: KL, entropy
+and effective sample size describe the policy's change only on the originals. With all elements, rows are
+group-major and the first block is the originals; with drawn elements, they are the rows that drew the
+identity, scattered over the batch.
+"""
+
+from __future__ import annotations
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from torchrl_sym.symmetry import Symmetry
+
+
+class Rows:
+    """All copies of a batch, group-major, or one drawn copy per row.
+
+    Args:
+        symmetry: what transforms how.
+        elements: indices of the elements to apply, the identity first; None to draw one per row.
+        td: the original rows, ``[B, ...]``.
+        mapped_keys: what differs between copies; they share every other entry.
+
+    Attributes:
+        td: the original rows.
+        expanded: the rows to evaluate, ``[N * B, ...]``, or ``[B, ...]`` if drawn.
+        element: the drawn elements, ``[B, ...]``; None if all were applied.
+        count: number of elements N.
+    """
+
+    def __init__(
+        self,
+        symmetry: Symmetry,
+        elements: list[int] | None,
+        td: TensorDictBase,
+        mapped_keys: list[NestedKey],
+    ) -> None:
+        self.td = td
+        self.count = symmetry.group.order if elements is None else len(elements)
+        self.element: Tensor | None = None
+        mapped, shared = td.select(*mapped_keys), td.exclude(*mapped_keys)
+        if elements is None:
+            self.element = torch.zeros(td.batch_size, dtype=torch.long, device=td.device)
+            if self.count > 1:  # the trivial group leaves the stream of random numbers as it is
+                self.element = torch.randint(self.count, td.batch_size, device=td.device)
+            self.expanded = symmetry(mapped, self.element).update(shared)
+        else:
+            orbit = symmetry.orbit(mapped, elements)
+            orbit.update(shared.expand(self.count, *td.batch_size))
+            self.expanded = orbit.reshape(-1, *td.batch_size[1:])
+
+    def originals(self, x):
+        """Rows of the identity. With drawn elements: all rows, weighted so that the mean is theirs."""
+        if self.element is None:
+            return x[: len(x) // self.count]
+        drawn = (self.element == 0).to(torch.get_default_dtype())
+        return x * (drawn / drawn.mean().clamp_min(1 / drawn.numel())).unsqueeze(-1)
+
+    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
+        """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
+        log_ratio = log_ratio.detach().squeeze(-1)
+        own = self._own(log_ratio)
+        ess = (2 * own.logsumexp(0) - (2 * own).logsumexp(0)).exp()
+        td_out.set("clip_fraction", self.originals(clipped).mean())
+        td_out.set("kl_approx", self.originals(kl.detach()).mean())
+        td_out.set("ESS", (ess / own.isfinite().sum(0).clamp_min(1)).nan_to_num())
+        td_out.set("max_ratio", own.max().exp())
+        td_out.set("mean_ratio", self.originals(log_ratio.exp().unsqueeze(-1)).mean())
+        td_out.set("clip_fraction_sym", self._per_element(clipped.squeeze(-1)))
+        td_out.set("kl_approx_sym", self._per_element(kl.detach().squeeze(-1)))
+        td_out.set("ESS_sym", self._ess_per_element(log_ratio))
+
+    def _own(self, log_ratio: Tensor) -> Tensor:
+        if self.element is None:
+            return log_ratio[: len(log_ratio) // self.count]
+        return log_ratio.masked_fill(self.element != 0, -torch.inf)
+
+    def _membership(self, x: Tensor) -> Tensor:
+        """Which rows belong to which element, ``(N, rows)`` bool."""
+        index = torch.arange(self.count, device=x.device)
+        if self.element is None:
+            return index.repeat_interleave(x.numel() // self.count) == index[:, None]
+        return self.element.flatten() == index[:, None]
+
+    def _per_element(self, x: Tensor) -> Tensor:
+        member = self._membership(x).to(x.dtype)
+        return (member @ x.flatten()) / member.sum(1).clamp_min(1)
+
+    def _ess_per_element(self, log_ratio: Tensor) -> Tensor:
+        member = self._membership(log_ratio)
+        lw = torch.where(member, log_ratio.flatten(), -torch.inf)
+        ess = (2 * lw.logsumexp(1) - (2 * lw).logsumexp(1)).exp()
+        return (ess / member.sum(1).clamp_min(1)).nan_to_num()
