@@ -6,14 +6,14 @@ the names.
 
 from typing import TYPE_CHECKING, Any
 
+from tasks import base
 from tasks import cartpole as cartpole  # importing a task's file registers the task
-from tasks.base import registered
 from tasks.environment import make_env
 
 if TYPE_CHECKING:
     from tasks.suite import load
 
-ALL_TASKS = registered()
+ALL_TASKS = base.registered()
 
 __all__ = ["ALL_TASKS", "load", "make_env"]
 
