@@ -34,7 +34,7 @@ class Arguments:
 
     seeds: int = 3
     """Seeds per method."""
-    iterations: int = 400
+    iterations: int = 350
     """Iterations per run, of 8192 steps each; the effect on the return shows after about 300."""
     episodes: int = 500
     """Evaluation episodes per starting side."""

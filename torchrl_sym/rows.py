@@ -78,19 +78,22 @@ class Rows:
             return log_ratio[: len(log_ratio) // self.count]
         return log_ratio.masked_fill(self.element != 0, -torch.inf)
 
-    def _membership(self, x: Tensor) -> Tensor:
-        """Which rows belong to which element, ``(N, rows)`` bool."""
-        index = torch.arange(self.count, device=x.device)
+    def _blocks(self, x: Tensor, fill: float) -> Tensor:
+        """Values by element, ``(N, rows)``; with drawn elements, ``fill`` where another was drawn."""
         if self.element is None:
-            return index.repeat_interleave(x.numel() // self.count) == index[:, None]
-        return self.element.flatten() == index[:, None]
+            return x.reshape(self.count, -1)
+        index = torch.arange(self.count, device=x.device)
+        return torch.where(self.element.flatten() == index[:, None], x.flatten(), fill)
+
+    def _rows_per_element(self, x: Tensor) -> Tensor | int:
+        if self.element is None:
+            return x.numel() // self.count
+        return torch.bincount(self.element.flatten(), minlength=self.count).clamp_min(1)
 
     def _per_element(self, x: Tensor) -> Tensor:
-        member = self._membership(x).to(x.dtype)
-        return (member @ x.flatten()) / member.sum(1).clamp_min(1)
+        return self._blocks(x, 0.0).sum(1) / self._rows_per_element(x)
 
     def _ess_per_element(self, log_ratio: Tensor) -> Tensor:
-        member = self._membership(log_ratio)
-        lw = torch.where(member, log_ratio.flatten(), -torch.inf)
+        lw = self._blocks(log_ratio, -torch.inf)
         ess = (2 * lw.logsumexp(1) - (2 * lw).logsumexp(1)).exp()
-        return (ess / member.sum(1).clamp_min(1)).nan_to_num()
+        return (ess / self._rows_per_element(log_ratio)).nan_to_num()

@@ -90,7 +90,7 @@ def train(
     symmetry = symmetry.to(config.device)
     actor, critic = make_networks(config, env, symmetry)
     parameters = [*actor.parameters(), *critic.parameters()]
-    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate)
+    optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
     losses = make_loss(config, actor, critic, symmetry)
     gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=critic, average_gae=True)
     naive = SymmetryAugment(symmetry, log_prob_from=actor) if config.augmentation == "naive" else None
@@ -114,8 +114,8 @@ def train(
         actor,
         frames_per_batch=config.num_envs * config.horizon,
         total_frames=-1,
-        policy_device=config.device,
-        storing_device=config.device,
+        policy_device=None if config.device == "cpu" else config.device,
+        storing_device=None if config.device == "cpu" else config.device,
         auto_register_policy_transforms=False,
     )
     log = make_logger(logger, folder, name="train")
@@ -206,6 +206,7 @@ def make_loss(
         "critic_coeff": config.critic_coeff,
         "entropy_coeff": config.entropy_coeff,
         "loss_critic_type": "l2",
+        "functional": False,  # swapping parameters in and out costs a tenth of a small update
     }
     if config.augmentation in ("all", "random"):
         kwargs |= {"elements": config.augmentation, "mirror_coeff": config.mirror_coeff}
@@ -214,7 +215,7 @@ def make_loss(
         kwargs["max_importance_ratio"] = math.exp(config.max_log_ratio)
     losses: list[LossModule] = [ClipPPOLoss(actor, critic, **kwargs)]
     if config.mirror_coeff > 0:
-        losses.append(MirrorLoss(actor, symmetry=symmetry, coeff=config.mirror_coeff))
+        losses.append(MirrorLoss(actor, symmetry=symmetry, coeff=config.mirror_coeff, functional=False))
     return losses
 
 
