@@ -149,21 +149,19 @@ class BatchedEnv(EnvBase):
             state.variables[name][rows] = value[rows].to(state.variables[name].dtype)
         truncated = state.time > self._time_limit
         terminated = task.terminated(state)
-        if terminated is None:
-            terminated = torch.zeros_like(truncated)
         if diverged is not None:
             reward = reward.masked_fill(diverged, 0.0)
-            terminated = terminated | diverged
-        if active is None:
-            torch.logical_or(terminated, truncated, out=self._over)
-        else:
-            self._over[active] = (terminated | truncated)[active]
+            terminated = diverged if terminated is None else terminated | diverged
+        over = truncated if terminated is None else terminated | truncated
+        self._over = over if active is None else torch.where(active, over, self._over)
+        if terminated is None:
+            terminated = torch.zeros_like(truncated)
         observation = task.observe(state)
         state.release()
         return self._output(
             observation=observation.to(torch.float32),
             reward=reward.to(torch.float32).unsqueeze(-1),
-            done=self._over.unsqueeze(-1).clone(),
+            done=self._over.unsqueeze(-1).clone(),  # truncated is another tensor
             terminated=terminated.unsqueeze(-1),
             truncated=truncated.unsqueeze(-1),
         )
@@ -246,7 +244,7 @@ class BatchedEnv(EnvBase):
             self._started = True
         for name, value in start.variables.items():
             self._state.variables[name][ids] = value
-        self._over[ids] = False
+        self._over = self._over.index_fill(0, ids, False)  # not in place: outputs may share it
 
     def _first_output(self) -> TensorDict:
         flags = torch.zeros(3, *self.batch_size, 1, dtype=torch.bool)

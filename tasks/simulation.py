@@ -125,7 +125,8 @@ class Simulation:
         No test for non-finite numbers is needed: MuJoCo checks positions, velocities and
         accelerations in every step, warns and resets the row.
         """
-        healthy = float(self.qvel.abs().amax()) <= self.max_velocity  # False for NaN
+        low, high = self.qvel.aminmax()
+        healthy = -self.max_velocity <= float(low) and float(high) <= self.max_velocity  # False for NaN
         return not healthy or int(self._warnings_flat.max()) > 0
 
     def _lost(self) -> Tensor:
