@@ -1,0 +1,81 @@
+"""Every script runs with tiny settings, and so does the code in the README."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+TINY = ["--config.iterations", "2", "--config.num-envs", "8", "--config.horizon", "8"]
+
+
+def run(script: str, *arguments: str) -> str:
+    """Output of a script, which must succeed."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / script), *map(str, arguments)]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr[-3000:]
+    return result.stdout
+
+
+def test_all_examples_are_run_here():
+    source = Path(__file__).read_text()
+    missing = [
+        path.name for path in (ROOT / "examples").glob("*.py") if f"examples/{path.name}" not in source
+    ]
+    assert not missing
+
+
+def test_augment_batch():
+    assert "64 samples become 256" in run("examples/augment_batch.py")
+
+
+def test_mirror_loss_falls():
+    losses = [float(x) for x in re.findall(r"mirror ([\d.]+)", run("examples/mirror_loss.py"))]
+    assert losses[-1] < 0.5 * losses[0]
+
+
+def test_symmetric_ppo():
+    assert "iteration 1" in run("examples/symmetric_ppo.py", "2")
+
+
+def test_own_environment_tells_right_from_wrong():
+    right, wrong = (float(x) for x in re.findall(r"error (\S+)", run("examples/own_environment.py")))
+    assert right == 0.0
+    assert wrong > 0.1
+
+
+def test_train_and_continue(tmp_path):
+    first = run("examples/train.py", "--folder", tmp_path, *TINY)
+    assert re.search(r"mean return -\d", first)
+    run("examples/train.py", "--folder", tmp_path, *TINY[2:], "--config.iterations", "3")
+    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 4
+
+
+def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
+    picture = tmp_path / "curves.png"
+    settings = ["--seeds", "1", "--iterations", "2", "--episodes", "4", "--workers", "2"]
+    output = run("examples/quickstart.py", *settings, "--folder", tmp_path, "--picture", picture)
+    assert "PPO + augmentation   mean" in output
+    assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_speed_writes_its_figures(tmp_path):
+    figures = tmp_path / "speed.json"
+    run("benchmarks/speed.py", "--rounds", "1", "--num-envs", "8", "--rows", "32", "--output", figures)
+    results = json.loads(figures.read_text())
+    assert results["env"][0]["env_over_raw"] > 0
+    assert {row["order"] for row in results["loss"]} == {1, 2, 4}
+    assert {row["elements"] for row in results["augment"]} == {"all", "random"}
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_code_in_the_readme(number):
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
+    assert len(blocks) == 2
+    exec(compile(blocks[number], "README.md", "exec"), {})
