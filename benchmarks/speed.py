@@ -82,15 +82,25 @@ def show(table: list[dict]) -> None:
     widths = {key: max(len(key), 9) for key in table[-1]}
     if len(table) == 1:
         print("  ".join(f"{key:>{width}s}" for key, width in widths.items()))
-    cells = (
-        f"{v:,.0f}"
-        if isinstance(v, float) and v >= 1000
-        else f"{v:.4g}"
-        if isinstance(v, float)
-        else str(v)
-        for v in table[-1].values()
-    )
-    print("  ".join(f"{cell:>{width}s}" for cell, width in zip(cells, widths.values(), strict=True)))
+    print("  ".join(f"{cell(table[-1][key]):>{width}s}" for key, width in widths.items()))
+
+
+def cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
+    return str(value)
+
+
+def markdown(results: dict) -> str:
+    """All tables, for people; the JSON file has the same figures for programs."""
+    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
+    text = f"Made by `python benchmarks/speed.py` on {results['machine']['processor']}; {versions}.\n"
+    for name in ("env", "loss", "augment"):
+        if name in results:
+            keys = list(results[name][0])
+            lines = [keys, ["---:"] * len(keys), *([cell(row[k]) for k in keys] for row in results[name])]
+            text += f"\n## {name}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return text
 
 
 # --- environments
@@ -329,7 +339,8 @@ def main(arguments: Arguments) -> None:
         kept = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(json.dumps(kept | results, indent=2) + "\n")
-        print(f"\nwritten to {arguments.output}")
+        arguments.output.with_suffix(".md").write_text(markdown(kept | results))
+        print(f"\nwritten to {arguments.output} and {arguments.output.with_suffix('.md')}")
 
 
 def processor() -> str:

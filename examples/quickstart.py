@@ -86,25 +86,26 @@ def train_all(arguments: Arguments) -> dict[tuple[str, int], Path]:
     return folders
 
 
-def print_table(results: dict[tuple[str, int], Evaluation], curves: dict[tuple[str, int], list]) -> None:
-    """One row per run, then the mean of each method."""
-    header = f"{'method':20s} {'seed':>4s} {'right':>8s} {'left':>8s} {'mean':>8s} {'variation':>10s}"
-    print(f"\n{header} {'mirror loss':>12s}")
+def make_table(results: dict[tuple[str, int], Evaluation], curves: dict[tuple[str, int], list]) -> str:
+    """One row per run, then the mean of each method, as a Markdown table."""
+    lines = [
+        "| method             | seed |   right |    left |    mean | variation | mirror loss |",
+        "|--------------------|-----:|--------:|--------:|--------:|----------:|------------:|",
+    ]
     for method in METHODS:
         rows = []
         for (name, seed), result in results.items():
             if name == method:
                 mirror = curves[name, seed][-1]["mirror_loss"]
                 rows.append([*result.goal_means.values(), result.mean, result.variation, mirror])
-                print(f"{method:20s} {seed:4d} {_row(rows[-1])}")
-        print(f"{method:20s} mean {_row(np.mean(rows, axis=0))}\n")
-    print("right, left: mean return when the pole starts on that side; variation: their difference;")
-    print("mirror loss: squared distance of K[pi(s)] from pi(L[s]) on the states of the last iteration.")
+                lines.append(f"| {method:18s} | {seed:4d} | {_row(rows[-1])} |")
+        lines.append(f"| {method:18s} | mean | {_row(np.mean(rows, axis=0))} |")
+    return "\n".join(lines)
 
 
 def _row(values) -> str:
     right, left, mean, variation, mirror = values
-    return f"{right:8.3f} {left:8.3f} {mean:8.3f} {variation:10.3f} {mirror:12.4f}"
+    return f"{right:7.3f} | {left:7.3f} | {mean:7.3f} | {variation:9.3f} | {mirror:11.4f}"
 
 
 def draw(
@@ -133,7 +134,6 @@ def draw(
     for axes in (left, middle, right):
         axes.spines[["top", "right"]].set_visible(False)
     figure.tight_layout()
-    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
 
@@ -157,8 +157,13 @@ def main(arguments: Arguments) -> None:
         key: evaluate(env, load_actor(folder, env, env.symmetry), arguments.episodes)
         for key, folder in folders.items()
     }
-    print_table(results, curves)
+    table = make_table(results, curves)
+    arguments.picture.parent.mkdir(parents=True, exist_ok=True)
+    arguments.picture.with_suffix(".md").write_text(table + "\n")
     draw(curves, results, arguments.picture)
+    print(f"\n{table}\n")
+    print("right, left: mean return when the pole starts on that side; variation: their difference;")
+    print("mirror loss: squared distance of K[pi(s)] from pi(L[s]) on states of the last iteration.")
     print(f"\nlearning curves: {arguments.picture}")
 
 

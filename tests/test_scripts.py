@@ -60,7 +60,7 @@ def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     picture = tmp_path / "curves.png"
     settings = ["--seeds", "1", "--iterations", "2", "--episodes", "4", "--workers", "2"]
     output = run("examples/quickstart.py", *settings, "--folder", tmp_path, "--picture", picture)
-    assert "PPO + augmentation   mean" in output
+    assert "| PPO + augmentation | mean |" in output
     assert picture.stat().st_size > 10_000
 
 
