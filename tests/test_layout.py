@@ -24,6 +24,7 @@ MAX_LINES = 400
 LAYERS = (
     "groups",
     "representations",
+    "specs",
     "symmetry",
     "rows",
     "transforms mirror_loss symmetric_ppo modules normalization mujoco testing",

@@ -244,9 +244,7 @@ def test_orbit_refuses_random_elements_and_a_missing_sample_unit():
     with pytest.raises(ValueError, match=r"use SymmetryAugment\(elements='random'\)"):
         SymmetryOrbit(make_symmetry(), "random")
     buffer = filled(ReplayBuffer, batch_size=5, transform=SymmetryOrbit(make_symmetry()).transform())
-    with pytest.raises(
-        RuntimeError, match=r"multiple of 2 rows, got 5; pass the SymmetryOrbit .* sample_unit"
-    ):
+    with pytest.raises(RuntimeError, match=r"rows as they are stored; pass the orbit .* sample_unit=orbit"):
         buffer.sample()
 
 

@@ -142,10 +142,10 @@ def test_mean_follows_the_action_and_scale_has_no_sign(parent):
     assert image[(*parent, "scale")].tolist() == [[2, 1], [4, 3]]
 
 
-def test_scale_of_entries_that_mix_is_unknown_until_declared():
+def test_scale_of_entries_that_mix_must_be_declared():
     group = PointGroup.rotation(3)
     batch = TensorDict(action=random(5, 2), scale=random(5, 2).exp(), batch_size=[5])
-    with pytest.raises(KeyError, match=r"the batch has 'scale', which this symmetry does not know"):
+    with pytest.raises(KeyError, match=r"the batch has 'scale', but .* mixes entries"):
         Symmetry(group, {"action": planar(group)})(batch, 1)
     declared = Symmetry(group, {"action": planar(group), "scale": invariant(group, 2)})
     assert torch.equal(declared(batch, 1)["scale"], batch["scale"])

@@ -12,12 +12,14 @@ symmetry metric.
 from __future__ import annotations
 
 import contextlib
+import copy
 from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
+from torchrl.modules import OneHotCategorical
 from torchrl.objectives import LossModule
 
 from torchrl_sym.representations import Representation, invariant
@@ -102,7 +104,11 @@ class MirrorLoss(LossModule):
         else:
             self.actor_network = actor_network
             self.actor_network_params = None  # type: ignore[assignment]
-        self.symmetry = symmetry
+        if not coeff >= 0:
+            raise ValueError(f"expected coeff >= 0, got {coeff}")
+        if reduction not in (None, "none", "mean", "sum"):
+            raise ValueError(f"expected reduction 'none', 'mean' or 'sum', got {reduction!r}")
+        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
         self.stop_gradient = stop_gradient
         self.per_element = per_element
         self.reduction = "mean" if reduction is None else reduction
@@ -185,7 +191,7 @@ class MirrorLoss(LossModule):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.actor_network.in_keys), self.in_keys[0])
+        state = batched(tensordict.select(*self.actor_network.in_keys, strict=False), self.in_keys[0])
         orbit = self.symmetry.orbit(state)  # [N, *B], identity first
         act = self._output_representation()
         if self.stop_gradient and len(orbit) > 1:
@@ -222,6 +228,13 @@ def single_action(actor: TensorDictModule) -> NestedKey:
 
 def deterministic_action(dist: torch.distributions.Distribution) -> Tensor:
     """The action pi(s) of a distribution: its deterministic sample, or its mean."""
+    if isinstance(dist, OneHotCategorical | torch.distributions.OneHotCategorical):
+        return dist.probs  # the mode has no gradient; a permutation maps the probabilities alike
+    if isinstance(dist, torch.distributions.Categorical):
+        raise TypeError(
+            "expected an action that a representation can map, got an integer from a Categorical; use "
+            "one-hot actions (OneHotCategorical) with a permutation"
+        )
     sample = getattr(dist, "deterministic_sample", None)
     return dist.mean if sample is None else sample
 
@@ -236,7 +249,12 @@ def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
 
     ``dispatch`` takes the longest shape that all entries share, at times with their last dimension.
     """
-    value = tensordict.get(key)
+    value = tensordict.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"expected an entry {key!r}, which the network reads; the batch has "
+            f"{sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))}"
+        )
     if tensordict.batch_dims in (0, value.ndim):
         tensordict.batch_size = value.shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
     return tensordict

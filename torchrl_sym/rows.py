@@ -57,7 +57,13 @@ class Rows:
         if self.element is None:
             return x[: len(x) // self.count]
         drawn = (self.element == 0).to(torch.get_default_dtype())
-        return x * (drawn / drawn.mean().clamp_min(1 / drawn.numel())).unsqueeze(-1)
+        weight = drawn / drawn.mean().clamp_min(1 / drawn.numel())
+        return x * weight.reshape(weight.shape + (1,) * (x.ndim - weight.ndim))
+
+    def _element_of(self, x: Tensor) -> Tensor:
+        """The drawn elements in the shape of x, which may have more dimensions (agents) than the batch."""
+        assert self.element is not None
+        return self.element.reshape(self.element.shape + (1,) * (x.ndim - self.element.ndim)).expand_as(x)
 
     def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
         """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
@@ -76,19 +82,19 @@ class Rows:
     def _own(self, log_ratio: Tensor) -> Tensor:
         if self.element is None:
             return log_ratio[: len(log_ratio) // self.count]
-        return log_ratio.masked_fill(self.element != 0, -torch.inf)
+        return log_ratio.masked_fill(self._element_of(log_ratio) != 0, -torch.inf)
 
     def _blocks(self, x: Tensor, fill: float) -> Tensor:
         """Values by element, ``(N, rows)``; with drawn elements, ``fill`` where another was drawn."""
         if self.element is None:
             return x.reshape(self.count, -1)
         index = torch.arange(self.count, device=x.device)
-        return torch.where(self.element.flatten() == index[:, None], x.flatten(), fill)
+        return torch.where(self._element_of(x).flatten() == index[:, None], x.flatten(), fill)
 
     def _rows_per_element(self, x: Tensor) -> Tensor | int:
         if self.element is None:
             return x.numel() // self.count
-        return torch.bincount(self.element.flatten(), minlength=self.count).clamp_min(1)
+        return torch.bincount(self._element_of(x).flatten(), minlength=self.count).clamp_min(1)
 
     def _per_element(self, x: Tensor) -> Tensor:
         return self._blocks(x, 0.0).sum(1) / self._rows_per_element(x)

@@ -11,6 +11,7 @@ naive augmentation, whose denominator pi_k(K_g[a] | L_g[s]) can be arbitrarily s
 from __future__ import annotations
 
 import contextlib
+import copy
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
@@ -103,10 +104,10 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         **clip_ppo_kwargs,
     ) -> None:
         super().__init__(actor_network, critic_network, **clip_ppo_kwargs)
-        self.symmetry = symmetry
+        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
         self.random = elements == "random"
         self.elements = symmetry.elements(elements)
-        if mirror_coeff < 0:
+        if not mirror_coeff >= 0:
             raise ValueError(f"expected mirror_coeff >= 0, got {mirror_coeff}")
         self._mirrors = mirror_coeff > 0
         if self._mirrors:
@@ -124,7 +125,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
 
     def _require_keys(self) -> None:
         self.symmetry.require(_inputs(self.actor_network), "the actor")
-        self.symmetry.require(_inputs(self.critic_network), "the critic")
+        self.symmetry.require(self._critic_inputs(), "the critic")
         self.symmetry.require(_as_list(self.tensor_keys.action), "the surrogate objective")
 
     @property
@@ -202,9 +203,14 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         advantage = self._maybe_normalize_advantage(advantage, td, update_norm=missing)
         td.set(self.tensor_keys.advantage, advantage)
 
+    def _critic_inputs(self) -> list[NestedKey]:
+        """What the critic reads from the batch; a shared trunk's output is the actor's to write."""
+        written = {unravel_key(key) for key in self.actor_network.out_keys}
+        return [key for key in _inputs(self.critic_network) if unravel_key(key) not in written]
+
     def _mapped_keys(self) -> list[NestedKey]:
         """What differs between symmetric copies; they share the rest of what the loss reads."""
-        networks = [*_inputs(self.actor_network), *_inputs(self.critic_network)]
+        networks = [*_inputs(self.actor_network), *self._critic_inputs()]
         return [*networks, *_as_list(self.tensor_keys.action)]
 
     def _read_keys(self) -> list[NestedKey]:

@@ -15,12 +15,11 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
-from torchrl.data import Bounded, TensorSpec
-from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import EnvBase
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.representations import Representation
+from torchrl_sym.specs import check_box, check_normalizers, check_size
 
 Elements = Literal["all", "random"] | Sequence[str]
 
@@ -31,7 +30,8 @@ _INVARIANT = frozenset(
         *("reward", "done", "terminated", "truncated", "is_init", "step_count", "episode_reward"),
         *("advantage", "value_target", "state_value", "value_error", "returns", "td_error"),
         *("index", "index_generation", "priority_weight", "mask", "shifted_valid", "traj_ids"),
-        *("sample_log_prob", "symmetry_id"),
+        *("sample_log_prob", "symmetry_id", "original_reward", "steps_to_next_obs", "gamma", "nonterminal"),
+        *("traj_count", "target_return", "time_step", "time_reset", "time_policy"),
     ]
 )
 
@@ -95,19 +95,15 @@ class Symmetry(nn.Module):
         self._table: dict[NestedKey, Representation] = dict(
             zip(self._keys, representations.values(), strict=True)
         )
-        self._add_distribution_parameters()
-
-    def _add_distribution_parameters(self) -> None:
-        for key in list(self._keys):
+        # what actors write beside an action; entries of batches only, never observations
+        self._written: dict[NestedKey, Representation | None] = {}
+        for key, action in self._table.items():
             parent, leaf = _split(key)
-            if leaf != "action":
-                continue
-            action = self._table[key]
-            self._table.setdefault(_join(parent, "loc"), action)
-            if action.is_signed_permutation:
-                scale = action.absolute()
-                self.representations.append(scale)  # registered, so that it follows to(device)
-                self._table.setdefault(_join(parent, "scale"), scale)
+            if leaf == "action":
+                scale = action.absolute() if action.is_signed_permutation else None
+                if scale is not None:
+                    self.representations.append(scale)  # registered, so that it follows to(device)
+                self._written |= {_join(parent, "loc"): action, _join(parent, "scale"): scale}
 
     def keys(self) -> list[NestedKey]:
         """The declared keys."""
@@ -130,8 +126,14 @@ class Symmetry(nn.Module):
         return self._table[_without_next(unravel_key(key))]
 
     def require(self, keys: Iterable[NestedKey], reader: str) -> None:
-        """Raise KeyError unless every key is declared; ``reader`` says who needs them."""
-        missing = [key for key in keys if key not in self]
+        """Raise KeyError unless every key is declared, or of a kind that copies share."""
+        missing = [key for key in keys if key not in self and not _is_shared(key)]
+        if any("recurrent_state" in _split(key)[1] for key in missing):
+            raise KeyError(
+                f"{reader} reads the memory {missing}: the memory after a mirrored history is not a linear "
+                "image of the stored one; start copies from a zero memory (declare it invariant and sample "
+                "slices that begin where is_init is set), or use a policy without memory"
+            )
         if missing:
             raise KeyError(
                 f"{reader} reads {missing}, which this symmetry does not transform (it has "
@@ -165,10 +167,7 @@ class Symmetry(nn.Module):
         """
         out = tensordict.copy()
         for key, representation, value in self._mapped(tensordict):
-            index = g
-            if isinstance(g, Tensor):  # entries may have more batch dimensions than the tensordict
-                index = g.reshape(g.shape + (1,) * (value.ndim - 1 - g.ndim)).expand(value.shape[:-1])
-            out.set(key, representation(value, index))
+            out.set(key, representation(value, g))
         return out
 
     def orbit(self, tensordict: TensorDictBase, elements: Sequence[int] | None = None) -> TensorDictBase:
@@ -207,17 +206,17 @@ class Symmetry(nn.Module):
     def _resolve(self, key: NestedKey) -> Representation | None:
         """Representation of a batch entry, None if copies share it, KeyError if it is unknown."""
         bare = _without_next(unravel_key(key))
-        representation = self._table.get(bare)
-        if representation is not None:
-            return representation
-        parent, leaf = _split(bare)
-        shared = (
-            leaf in _INVARIANT
-            or leaf.endswith("log_prob")
-            or leaf.startswith("_")
-            or (parent and parent[0] == "collector")
-        )
-        if self.strict and not shared:
+        if bare in self._table:
+            return self._table[bare]
+        if bare in self._written:
+            if self._written[bare] is None:
+                raise KeyError(
+                    f"the batch has {key!r}, but the action's representation mixes entries, which carries "
+                    "no diagonal scale to another; drop it with select=..., or declare it with "
+                    "invariant(group, d) if all its entries are equal"
+                )
+            return self._written[bare]
+        if self.strict and not _is_shared(bare):
             raise KeyError(
                 f"the batch has {key!r}, which this symmetry does not know (it has {self._keys}); add "
                 "its representation, e.g. invariant(group, d) if no element changes it, drop it with "
@@ -230,58 +229,41 @@ class Symmetry(nn.Module):
 
         Every element must map each bounded box onto itself. Otherwise a mirrored action leaves the
         box: a tanh-squashed policy then assigns it a log-probability that is off by hundreds of nats.
+        Boxes of observations that turn by less than a right angle are not checked: no box is mapped
+        onto itself then, and nothing depends on it.
 
         Raises:
             KeyError: an observation or action of the environment is not declared (strict).
-            ValueError: a size differs, or a box is not symmetric; the message names key and entry.
+            ValueError: a size differs, a box is not symmetric, or a running normaliser, which L_g does
+                not commute with, is applied to a declared observation.
         """
-        for specs in (env.observation_spec, env.full_action_spec):
+        check_normalizers(env, self._keys)
+        for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
             for key, spec in specs.items(include_nested=True, leaves_only=True):
-                representation = self._resolve(key)
-                if representation is not None:
-                    _check_size(key, spec, representation)
-                    _check_box(key, spec, representation)
+                if key in self:
+                    check_size(key, spec, self[key])
+                    if is_action or self[key].is_signed_permutation:
+                        check_box(key, spec, self[key])
+                elif self.strict and not _is_shared(key):
+                    raise KeyError(
+                        f"the environment has {key!r}, which this symmetry does not know (it has "
+                        f"{self._keys}); add its representation, e.g. invariant(group, d) if no element "
+                        "changes it"
+                    )
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self._keys}"
 
 
-def _check_size(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
-    if not spec.shape or spec.shape[-1] != representation.dim:
-        raise ValueError(
-            f"{key!r}: the environment has shape {tuple(spec.shape)}, expected a last dimension of "
-            f"{representation.dim}"
-        )
-
-
-def _check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
-    if not isinstance(spec, Bounded) or not isinstance(spec.space, ContinuousBox):
-        return
-    bounds = [
-        bound.double().cpu().expand(spec.shape).reshape(-1, representation.dim)
-        for bound in (spec.space.low, spec.space.high)
-    ]
-    matrices = representation.matrices.cpu()
-    for row in torch.cat(bounds, dim=-1).unique(dim=0):  # environments of a batch share their box
-        if row.isnan().any():
-            raise ValueError(f"{key!r}: expected a box of numbers, got NaN in its bounds")
-        row_low, row_high = row.chunk(2)
-        # image of an interval under a matrix; 0 * inf counts as 0
-        at_low = torch.where(matrices == 0, 0.0, matrices * row_low)
-        at_high = torch.where(matrices == 0, 0.0, matrices * row_high)
-        image_low = torch.minimum(at_low, at_high).sum(-1)  # (N, d)
-        image_high = torch.maximum(at_low, at_high).sum(-1)
-        wrong = ~(
-            torch.isclose(image_low, row_low, atol=1e-6) & torch.isclose(image_high, row_high, atol=1e-6)
-        )
-        if wrong.any():
-            g, i = wrong.nonzero()[0].tolist()
-            raise ValueError(
-                f"{key!r}: the box of entry {i}, [{row_low[i]:g}, {row_high[i]:g}], is not mapped onto "
-                f"itself by {representation.group.names[g]!r}, whose image there is "
-                f"[{image_low[g, i]:g}, {image_high[g, i]:g}]; make the box symmetric (actions relative "
-                "to a symmetric default pose, equal limits on both sides)"
-            )
+def _is_shared(key: NestedKey) -> bool:
+    """Whether symmetric copies share an entry with their original, judging by its key."""
+    parent, leaf = _split(_without_next(unravel_key(key)))
+    return (
+        leaf in _INVARIANT
+        or leaf.endswith("log_prob")
+        or leaf.startswith("_")
+        or (len(parent) > 0 and parent[0] == "collector")
+    )
 
 
 def _without_next(key: NestedKey) -> NestedKey:

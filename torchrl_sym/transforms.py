@@ -9,6 +9,7 @@ buffers and behind collectors; :class:`SymmetryOrbit` does it where a buffer fix
 
 from __future__ import annotations
 
+import copy
 import inspect
 from collections.abc import Sequence
 from typing import Any, Literal, cast
@@ -94,7 +95,7 @@ class SymmetryAugment(Transform):
         if when not in ("sample", "extend"):
             raise ValueError(f"expected when='sample' or 'extend', got {when!r}")
         super().__init__(in_keys=symmetry.keys(), out_keys=symmetry.keys())
-        self.symmetry = symmetry
+        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
         self.random = elements == "random"
         self.elements = symmetry.elements(elements)
         self.layout = layout
@@ -136,6 +137,8 @@ class SymmetryAugment(Transform):
 
     def augment(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The augmented batch; the input is not modified.
+
+        Entries that copies share may also share memory, among each other and with the input.
 
         Args:
             tensordict: batch ``[B, ...]`` with at least one batch dimension.
@@ -234,9 +237,14 @@ class SymmetryAugment(Transform):
                 "log_prob_from needs the policy that collected the data, which has changed by the time "
                 "a buffer is sampled; use when='extend'"
             )
+        sliced = isinstance(buffer._sampler, SliceSampler)
+        if self.random and sliced:
+            raise RuntimeError(
+                "elements='random' draws an element per row, which would mix elements within a slice; use "
+                "elements='all' or a sampler of single rows"
+            )
         if not isinstance(buffer, TensorDictReplayBuffer) or self.random:
             return
-        sliced = isinstance(buffer._sampler, SliceSampler)
         if self.layout == "cat" or sliced:
             raise RuntimeError(
                 f"{type(buffer).__name__} fixes the number of records, which layout={self.layout!r} "
@@ -282,17 +290,25 @@ class SymmetryOrbit(SampleUnit):
             raise ValueError(
                 "random elements keep the number of records; use SymmetryAugment(elements='random')"
             )
-        self.symmetry = symmetry
+        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
         self.elements = symmetry.elements(elements)
 
     def transform(self) -> Transform:
         """The transform to pass to the buffer together with this sample unit."""
-        return _OrbitTransform(self.symmetry, self.elements)
+        return _OrbitTransform(self)
 
     def expand(
         self, index: Tensor | tuple[Tensor, ...], info: dict[str, Any], storage: Any
     ) -> tuple[Tensor | tuple[Tensor, ...], dict[str, Any]]:
         """Repeat anchors and the info entries that are aligned with them, group-major."""
+        buffer, _ = _calling_buffer()
+        if buffer is not None and not any(
+            isinstance(t, _OrbitTransform) for t in buffer._transform.modules()
+        ):
+            raise RuntimeError(
+                "a SymmetryOrbit alone repeats rows without mapping them; pass transform=orbit.transform() "
+                "to the buffer as well"
+            )
         n = len(self.elements)
         anchors = len(index[0] if isinstance(index, tuple) else index)
 
@@ -321,21 +337,27 @@ class SymmetryOrbit(SampleUnit):
 class _OrbitTransform(Transform):
     """Maps block k of group-major repeated rows by element k; keeps the batch size."""
 
-    def __init__(self, symmetry: Symmetry, elements: list[int]) -> None:
-        super().__init__(in_keys=symmetry.keys(), out_keys=symmetry.keys())
-        self.symmetry = symmetry
-        self.elements = elements
+    def __init__(self, orbit: SymmetryOrbit) -> None:
+        super().__init__(in_keys=orbit.symmetry.keys(), out_keys=orbit.symmetry.keys())
+        self.symmetry = orbit.symmetry
+        self.elements = orbit.elements
+
+    def set_container(self, container: Any) -> None:
+        super().set_container(container)
+        if self.parent is not None:
+            raise RuntimeError("the transform of a SymmetryOrbit cannot be appended to an environment")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         if tensordict.batch_dims == 0:
             return tensordict
-        if not torch.compiler.is_compiling() and _calling_buffer()[1] == "__getitem__":
+        buffer, method = _calling_buffer()
+        if method == "__getitem__":
             return tensordict  # buffer[4:8] reads rows as they are stored, without the sample unit
         rows, n = tensordict.batch_size[0], len(self.elements)
-        if rows % n:
+        if not isinstance(getattr(buffer, "_sample_unit", None), SymmetryOrbit) or rows % n:
             raise RuntimeError(
-                f"expected a multiple of {n} rows, got {rows}; pass the SymmetryOrbit that made this "
-                "transform to the buffer as sample_unit"
+                "expected rows that were repeated by a SymmetryOrbit, got rows as they are stored; pass "
+                "the orbit that made this transform to the buffer as sample_unit=orbit"
             )
         element = torch.tensor(self.elements, device=tensordict.device)
         element = element.repeat_interleave(rows // n)

@@ -67,6 +67,9 @@ class PPOConfig:
     """Lower bound of the standard deviation."""
     max_std: float = 10.0
     """Upper bound of the standard deviation: clipped actions make a large one free of cost."""
+    tie_std: bool = False
+    """Give actions that the group exchanges (left and right knee) one standard deviation; without it, a
+    policy is symmetric in its mean only."""
     weight_scale: float = 1.0
     """Factor on PyTorch's uniform initialisation of the actor (the paper's initialisation study)."""
     last_layer_scale: float = 1.0
@@ -88,14 +91,18 @@ class PPOConfig:
             value = getattr(self, name)
             if value < 1 or int(value) != value:
                 raise ValueError(f"{name}: expected a whole number of at least 1, got {value}")
-        for name in ("learning_rate", "max_grad_norm", "initial_std", "min_std", "max_std"):
+        if not all(size >= 1 for size in self.hidden):
+            raise ValueError(f"hidden: expected positive sizes, got {self.hidden}")
+        positive = ("learning_rate", "max_grad_norm", "initial_std", "min_std", "max_std", "clip_epsilon")
+        for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("gamma", "lmbda"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}")
-        if not self.mirror_coeff >= 0:
-            raise ValueError(f"mirror_coeff: expected a number >= 0, got {self.mirror_coeff}")
+        for name in ("mirror_coeff", "entropy_coeff", "critic_coeff"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}")
         if self.num_envs * self.horizon % self.minibatches:
             raise ValueError(
                 f"minibatches: expected a divisor of num_envs * horizon = {self.num_envs * self.horizon}, "
@@ -105,10 +112,10 @@ class PPOConfig:
     def differences(self, other: dict) -> dict[str, tuple]:
         """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
 
-        The number of iterations and the checkpoint interval may change when a run is continued.
+        Iterations, checkpoint interval and device may change when a run is continued.
         """
         mine = dataclasses.asdict(self)
-        free = {"iterations", "checkpoint_interval"}
+        free = {"iterations", "checkpoint_interval", "device"}
         return {
             name: (other.get(name), value)
             for name, value in mine.items()

@@ -66,7 +66,7 @@ def symmetry_metrics(
     Args:
         actor: the policy pi_k that collected the data.
         symmetry: what transforms how.
-        data: a batch with observations and actions, of any batch size; 2048 rows of it are used.
+        data: a batch with observations and actions, of any batch size; at most 2048 rows are used.
 
     Returns:
         ``mirror_loss``, sum_g || K_g[pi(s)] - pi(L_g[s]) ||^2 (Eq. symm-loss); ``log_prob``, the mean of
@@ -74,7 +74,7 @@ def symmetry_metrics(
         denominator of naive augmentation (the paper's log-probability figure).
     """
     rows = data.select(*actor.in_keys, "action").reshape(-1)
-    rows = rows[:: max(1, len(rows) // _MAX_ROWS)]
+    rows = rows[:: math.ceil(len(rows) / _MAX_ROWS)]
     orbit = symmetry.orbit(rows)
     log_prob = actor.get_dist(orbit.select(*actor.in_keys)).log_prob(orbit["action"])  # (N, rows)
     copies = log_prob[1:] if len(log_prob) > 1 else log_prob

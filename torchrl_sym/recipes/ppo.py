@@ -7,6 +7,7 @@ and its advantage not the A_k(s, a) of Eq. (sym-aug).
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 import os
@@ -29,6 +30,7 @@ from torchrl_sym.mirror_loss import MirrorLoss
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_actor, make_critic
+from torchrl_sym.recipes.resume import resume, snapshot
 from torchrl_sym.recipes.storage import RunFolder, make_logger
 from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
 from torchrl_sym.symmetry import Symmetry
@@ -54,8 +56,9 @@ def train(
 
     With a folder, the run can be killed at any time and continues when called again, exactly: on one
     thread the metrics are those of a run that was never interrupted. This needs an environment with
-    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have; others begin new episodes. If the
-    environment has ``stagger()``, it is called first, so that batches hold all phases of an episode.
+    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have, without transforms; others begin
+    new episodes when they are continued, with a warning. If the environment has ``stagger()``, it is
+    called first, so that batches hold all phases of an episode.
 
     Args:
         config: hyper-parameters.
@@ -68,11 +71,13 @@ def train(
 
     Yields:
         iteration, frames, return (mean of the latest finished episodes), mirror_loss, log_prob and
-        log_prob_copies (mean log pi_k of samples and of their copies), kl, losses, learning rate, time.
+        log_prob_copies (mean log pi_k of samples and of their copies), kl, every loss and diagnostic of
+        the updates, learning_rate, std, seconds, frames_per_second.
 
     Raises:
         ValueError: the folder holds a run with another configuration.
         KeyError, ValueError: the environment and the symmetry do not fit.
+        TypeError: the action is not continuous.
         FloatingPointError: a loss is not finite; the last checkpoint is still good.
 
     Example:
@@ -87,7 +92,7 @@ def train(
     torch.manual_seed(config.seed)
     env = make_env(num_envs=config.num_envs, seed=config.seed)
     symmetry.check_specs(env)
-    symmetry = symmetry.to(config.device)
+    symmetry = copy.deepcopy(symmetry).to(config.device)
     actor, critic = make_networks(config, env, symmetry)
     parameters = [*actor.parameters(), *critic.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=config.learning_rate, fused=True)
@@ -104,10 +109,9 @@ def train(
     episodes = Episodes(env)
     run = None if folder is None else RunFolder(folder)
     parts = {"actor": actor, "critic": critic, "optimizer": optimizer}
-    start, elapsed = _resume(run, config, env, parts, episodes)
-    if start == 0 and hasattr(env, "stagger"):
-        env.stagger()  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+    start, elapsed = resume(run, config, env, parts, episodes)
     if start >= config.iterations:
+        env.close()
         return
     collector = Collector(
         env,
@@ -139,7 +143,7 @@ def train(
             if run is not None:
                 run.append(metrics)
                 if iteration % config.checkpoint_interval == 0 or iteration >= config.iterations:
-                    run.save(_snapshot(config, env, parts, episodes, iteration, metrics["seconds"]))
+                    run.save(snapshot(config, env, parts, episodes, iteration, metrics["seconds"]))
             if log is not None:
                 log.log_metrics(metrics, step=iteration)
             bar.update()
@@ -158,7 +162,18 @@ def train(
 def make_networks(
     config: PPOConfig, env: EnvBase, symmetry: Symmetry
 ) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
-    """Actor and critic that read every observation of the environment that the symmetry declares."""
+    """Actor and critic that read every observation of the environment that the symmetry declares.
+
+    Raises:
+        KeyError: the symmetry declares none of the observations.
+        TypeError: the action is not one continuous ``"action"``.
+    """
+    spec = env.full_action_spec.get("action", None)
+    if list(env.action_keys) != ["action"] or spec is None or not spec.dtype.is_floating_point:
+        raise TypeError(
+            f"expected one continuous action under 'action', got {env.full_action_spec}; write a loop with "
+            "SymmetricClipPPOLoss for other actions"
+        )
     keys = [key for key in symmetry.keys() if key in env.observation_spec.keys(True, True)]  # noqa: SIM118
     if not keys:
         raise KeyError(
@@ -166,7 +181,7 @@ def make_networks(
             f"symmetry declares ({symmetry.keys()}); add them"
         )
     size = sum(env.observation_spec[key].shape[-1] for key in keys)
-    actor = make_actor(config, keys, size, env.action_spec.shape[-1]).to(config.device)
+    actor = make_actor(config, keys, size, spec.shape[-1], symmetry["action"]).to(config.device)
     return actor, make_critic(config, keys, size).to(config.device)
 
 
@@ -253,8 +268,9 @@ def _learn(
             out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
             if schedule is not None:
                 schedule.step(out["kl"])
-            for key in ("kl", "clip_fraction", "entropy", "loss_objective", "loss_critic"):
-                sums[key] = sums.get(key, 0.0) + out[key].detach()
+            for key, value in out.items():
+                if value.numel() == 1:
+                    sums[key] = sums.get(key, 0.0) + value.detach()
     metrics = {key: float(value) / updates for key, value in sums.items()}
     return metrics | {"learning_rate": optimizer.param_groups[0]["lr"]}
 
@@ -264,50 +280,3 @@ def _schedule(config: PPOConfig, optimizer: torch.optim.Optimizer) -> KLAdaptive
         return None
     bounds = {"min_lr": config.min_learning_rate, "max_lr": config.max_learning_rate}
     return KLAdaptiveLR(optimizer, config.desired_kl, **bounds)
-
-
-def _snapshot(
-    config: PPOConfig,
-    env: EnvBase,
-    parts: dict[str, Any],
-    episodes: Episodes,
-    iteration: int,
-    seconds: float,
-) -> dict[str, Any]:
-    """Everything that decides the future of the run, as plain containers of tensors and numbers."""
-    save_env = getattr(env, "save_state", None)
-    return {
-        "config": dataclasses.asdict(config),
-        "iteration": iteration,
-        "seconds": seconds,
-        "parts": {name: part.state_dict() for name, part in parts.items()},
-        "episodes": episodes.state_dict(),
-        "rng": torch.get_rng_state(),
-        "env": None if save_env is None else save_env(),
-    }
-
-
-def _resume(
-    run: RunFolder | None, config: PPOConfig, env: EnvBase, parts: dict[str, Any], episodes: Episodes
-) -> tuple[int, float]:
-    """Load the folder's checkpoint, if any; returns the iterations done and the seconds they took."""
-    checkpoint = None if run is None else run.load()
-    if run is None or checkpoint is None:
-        if run is not None:
-            run.truncate(0)  # a row that was logged before the first checkpoint
-        return 0, 0.0
-    differences = config.differences(checkpoint["config"])
-    if differences:
-        raise ValueError(
-            f"{run.path} holds a run with another configuration, {{field: (stored, requested)}} = "
-            f"{differences}; use another folder, or delete this one to start anew"
-        )
-    for name, part in parts.items():
-        part.load_state_dict(checkpoint["parts"][name])
-    episodes.load_state_dict(checkpoint["episodes"])
-    restore_env = getattr(env, "restore_state", None)
-    if restore_env is not None:
-        restore_env(checkpoint["env"])
-    torch.set_rng_state(checkpoint["rng"])
-    run.truncate(checkpoint["iteration"])
-    return checkpoint["iteration"], checkpoint["seconds"]

@@ -9,6 +9,7 @@ is a direct sum of small ones, written in the order of its entries:
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 
 import torch
@@ -104,13 +105,16 @@ class Representation(nn.Module):
 
         Args:
             x: ``(..., d)``.
-            g: an element by index or name, or a tensor of indices of shape ``x.shape[:-1]``.
+            g: an element by index or name, or a tensor of indices whose shape is that of the leading
+                dimensions of ``x``.
 
         Returns:
             ``rho(g) x``, of the shape and dtype of ``x``.
         """
         self._check_size(x)
         if isinstance(g, Tensor):
+            self._check_elements(g, x)
+            g = g.reshape(g.shape + (1,) * (x.ndim - 1 - g.ndim)).expand(x.shape[:-1])
             return self._over_blocks(x, lambda block, part: block.rows(part, g))
         g = self.group.index(g)
         return self._over_blocks(x, lambda block, part: block.element(part, g))
@@ -133,6 +137,24 @@ class Representation(nn.Module):
                 "the representation must list every entry of the tensor in order"
             )
 
+    def _check_elements(self, g: Tensor, x: Tensor) -> None:
+        if (
+            g.is_floating_point()
+            or g.dtype == torch.bool
+            or g.shape != x.shape[: g.ndim]
+            or g.ndim >= x.ndim
+        ):
+            raise ValueError(
+                f"expected indices of elements of a shape that {tuple(x.shape)} begins with, got {g.dtype} "
+                f"of shape {tuple(g.shape)}"
+            )
+        if not torch.compiler.is_compiling() and g.numel():
+            low, high = g.aminmax()
+            if low < 0 or high >= self.group.order:
+                raise KeyError(
+                    f"expected element indices in [0, {self.group.order}), got {int(low)} to {int(high)}"
+                )
+
     def __add__(self, other: Representation) -> Representation:
         if not isinstance(other, Representation):
             return NotImplemented
@@ -145,9 +167,10 @@ class Representation(nn.Module):
         return Representation.from_blocks(self.group, blocks, check=False)
 
     def __mul__(self, times: int) -> Representation:
-        if not isinstance(times, int) or times < 1:
+        if not hasattr(times, "__index__") or times < 1:
             raise ValueError(f"expected a positive number of repetitions, got {times!r}")
-        return Representation.from_blocks(self.group, [*self.blocks] * times, check=False)
+        blocks = [*self.blocks] * operator.index(times)
+        return Representation.from_blocks(self.group, blocks, check=False)
 
     __rmul__ = __mul__
 
