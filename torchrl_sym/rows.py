@@ -15,91 +15,101 @@ from torch import Tensor
 from torchrl_sym.symmetry import Symmetry
 
 
-class Rows:
-    """All copies of a batch, group-major, or one drawn copy per row.
+class OrbitRows:
+    """All copies of a batch, group-major, the originals first.
 
     Args:
         symmetry: what transforms how.
-        elements: indices of the elements to apply, the identity first; None to draw one per row.
+        elements: indices of the elements to apply, the identity first.
         td: the original rows, ``[B, ...]``.
         mapped_keys: what differs between copies; they share every other entry.
 
     Attributes:
         td: the original rows.
-        expanded: the rows to evaluate, ``[N * B, ...]``, or ``[B, ...]`` if drawn.
-        element: the drawn elements, ``[B, ...]``; None if all were applied.
+        expanded: the rows to evaluate, ``[N * B, ...]``.
         count: number of elements N.
     """
 
     def __init__(
-        self,
-        symmetry: Symmetry,
-        elements: list[int] | None,
-        td: TensorDictBase,
-        mapped_keys: list[NestedKey],
+        self, symmetry: Symmetry, elements: list[int], td: TensorDictBase, mapped_keys: list[NestedKey]
     ) -> None:
         self.td = td
-        self.count = symmetry.group.order if elements is None else len(elements)
-        self.element: Tensor | None = None
-        mapped, shared = td.select(*mapped_keys), td.exclude(*mapped_keys)
-        if elements is None:
-            self.element = torch.zeros(td.batch_size, dtype=torch.long, device=td.device)
-            if self.count > 1:  # the trivial group leaves the stream of random numbers as it is
-                self.element = torch.randint(self.count, td.batch_size, device=td.device)
-            self.expanded = symmetry(mapped, self.element).update(shared)
-        else:
-            orbit = symmetry.orbit(mapped, elements)
-            orbit.update(shared.expand(self.count, *td.batch_size))
-            self.expanded = orbit.reshape(-1, *td.batch_size[1:])
+        self.count = len(elements)
+        self.expanded = symmetry.orbit(td, elements, keys=mapped_keys).reshape(-1, *td.batch_size[1:])
 
     def originals(self, x):
-        """Rows of the identity. With drawn elements: all rows, weighted so that the mean is theirs."""
-        if self.element is None:
-            return x[: len(x) // self.count]
+        """Rows of the identity, of a tensor or tensordict."""
+        return x[: len(x) // self.count]
+
+    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
+        """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
+        values = {
+            "kl_approx": kl.detach(),
+            "clip_fraction": clipped,
+            "mean_ratio": log_ratio.detach().exp(),
+        }
+        for name, value in values.items():
+            td_out.set(name, self.originals(value).mean())
+        td_out.set("max_ratio", self.originals(values["mean_ratio"]).max())
+        lw = self.originals(log_ratio.detach()).squeeze(-1)
+        td_out.set("ESS", _effective_size(lw, 0) / len(lw))
+        blocks = log_ratio.detach().reshape(self.count, -1)
+        td_out.set("ESS_sym", _effective_size(blocks, 1) / blocks.shape[1])
+        for name in ("kl_approx", "clip_fraction"):
+            td_out.set(f"{name}_sym", values[name].reshape(self.count, -1).mean(1))
+
+
+class DrawnRows:
+    """One copy per row, under an element drawn uniformly for each.
+
+    Args:
+        symmetry: what transforms how.
+        td: the original rows, ``[B, ...]``.
+        mapped_keys: what differs between copies; they share every other entry.
+
+    Attributes:
+        td: the original rows.
+        expanded: the rows to evaluate, ``[B, ...]``.
+        element: the drawn elements, ``[B, ...]``.
+        count: number of elements N.
+    """
+
+    def __init__(self, symmetry: Symmetry, td: TensorDictBase, mapped_keys: list[NestedKey]) -> None:
+        self.td = td
+        self.count = symmetry.group.order
+        self.element = torch.randint(self.count, td.batch_size, device=td.device)
+        self.expanded = symmetry(td, self.element, keys=mapped_keys)
+
+    def originals(self, x):
+        """All rows, weighted so that their mean is that of the rows that drew the identity."""
         drawn = (self.element == 0).to(torch.get_default_dtype())
         weight = drawn / drawn.mean().clamp_min(1 / drawn.numel())
         return x * weight.reshape(weight.shape + (1,) * (x.ndim - weight.ndim))
 
-    def _element_of(self, x: Tensor) -> Tensor:
-        """The drawn elements in the shape of x, which may have more dimensions (agents) than the batch."""
-        assert self.element is not None
-        return self.element.reshape(self.element.shape + (1,) * (x.ndim - self.element.ndim)).expand_as(x)
-
     def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
-        """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
-        log_ratio = log_ratio.detach().squeeze(-1)
-        own = self._own(log_ratio)
-        ess = (2 * own.logsumexp(0) - (2 * own).logsumexp(0)).exp()
-        td_out.set("clip_fraction", self.originals(clipped).mean())
-        td_out.set("kl_approx", self.originals(kl.detach()).mean())
-        td_out.set("ESS", (ess / own.isfinite().sum(0).clamp_min(1)).nan_to_num())
+        """Diagnostics of the rows that drew the identity, and of every element, ``(N,)``."""
+        lw = log_ratio.detach().squeeze(-1)  # may have more dimensions (agents) than the batch
+        element = self.element.reshape(self.element.shape + (1,) * (lw.ndim - self.element.ndim)).expand_as(
+            lw
+        )
+        index = torch.arange(self.count, device=lw.device)
+        member = element.flatten() == index[:, None]  # (N, rows)
+        size = member.sum(1).clamp_min(1)
+        values = torch.stack([kl.detach().squeeze(-1), clipped.squeeze(-1), lw.exp()]).flatten(1)
+        kl_sym, clip_sym, ratio_sym = values @ member.to(values.dtype).mT / size
+        ess = _effective_size(torch.where(member, lw.flatten(), -torch.inf), 1)
+        own = lw.masked_fill(element != 0, -torch.inf)
+        own_ess = _effective_size(own, 0) / own.isfinite().sum(0).clamp_min(1)
+        td_out.set("kl_approx", kl_sym[0])
+        td_out.set("clip_fraction", clip_sym[0])
+        td_out.set("mean_ratio", ratio_sym[0])
         td_out.set("max_ratio", own.max().exp())
-        td_out.set("mean_ratio", self.originals(log_ratio.exp().unsqueeze(-1)).mean())
-        td_out.set("clip_fraction_sym", self._per_element(clipped.squeeze(-1)))
-        td_out.set("kl_approx_sym", self._per_element(kl.detach().squeeze(-1)))
-        td_out.set("ESS_sym", self._ess_per_element(log_ratio))
+        td_out.set("ESS", own_ess.nan_to_num())
+        td_out.set("kl_approx_sym", kl_sym)
+        td_out.set("clip_fraction_sym", clip_sym)
+        td_out.set("ESS_sym", (ess / size).nan_to_num())
 
-    def _own(self, log_ratio: Tensor) -> Tensor:
-        if self.element is None:
-            return log_ratio[: len(log_ratio) // self.count]
-        return log_ratio.masked_fill(self._element_of(log_ratio) != 0, -torch.inf)
 
-    def _blocks(self, x: Tensor, fill: float) -> Tensor:
-        """Values by element, ``(N, rows)``; with drawn elements, ``fill`` where another was drawn."""
-        if self.element is None:
-            return x.reshape(self.count, -1)
-        index = torch.arange(self.count, device=x.device)
-        return torch.where(self._element_of(x).flatten() == index[:, None], x.flatten(), fill)
-
-    def _rows_per_element(self, x: Tensor) -> Tensor | int:
-        if self.element is None:
-            return x.numel() // self.count
-        return torch.bincount(self._element_of(x).flatten(), minlength=self.count).clamp_min(1)
-
-    def _per_element(self, x: Tensor) -> Tensor:
-        return self._blocks(x, 0.0).sum(1) / self._rows_per_element(x)
-
-    def _ess_per_element(self, log_ratio: Tensor) -> Tensor:
-        lw = self._blocks(log_ratio, -torch.inf)
-        ess = (2 * lw.logsumexp(1) - (2 * lw).logsumexp(1)).exp()
-        return (ess / self._rows_per_element(log_ratio)).nan_to_num()
+def _effective_size(log_weight: Tensor, dim: int) -> Tensor:
+    """Effective sample size (sum w)^2 / sum w^2, in log space."""
+    return (2 * log_weight.logsumexp(dim) - (2 * log_weight).logsumexp(dim)).exp()

@@ -25,7 +25,7 @@ from torchrl.objectives.ppo import (
 )
 
 from torchrl_sym.mirror_loss import batched, deterministic_action, single_action, squared_distance
-from torchrl_sym.rows import Rows
+from torchrl_sym.rows import DrawnRows, OrbitRows
 from torchrl_sym.symmetry import Elements, Symmetry
 
 
@@ -105,7 +105,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
     ) -> None:
         super().__init__(actor_network, critic_network, **clip_ppo_kwargs)
         self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
-        self.random = elements == "random"
+        self.random = elements == "random" and symmetry.group.order > 1  # else there is nothing to draw
         self.elements = symmetry.elements(elements)
         if not mirror_coeff >= 0:
             raise ValueError(f"expected mirror_coeff >= 0, got {mirror_coeff}")
@@ -146,7 +146,11 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
         self._prepare_advantage(td)
         td = td.select(*self._read_keys(), strict=False)
-        rows = Rows(self.symmetry, None if self.random else self.elements, td, self._mapped_keys())
+        mapped = self._mapped_keys()
+        if self.random:
+            rows = DrawnRows(self.symmetry, td, mapped)
+        else:
+            rows = OrbitRows(self.symmetry, self.elements, td, mapped)
         advantage = rows.expanded.get(self.tensor_keys.advantage)
 
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
@@ -227,11 +231,11 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         td_out.set("entropy", total.detach().mean())
         td_out.set("loss_entropy", self._weighted_loss_entropy(entropy))
 
-    def _mirror_error(self, rows: Rows, dist: torch.distributions.Distribution) -> Tensor:
+    def _mirror_error(self, rows: OrbitRows | DrawnRows, dist: torch.distributions.Distribution) -> Tensor:
         """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
         act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
         output = deterministic_action(dist)  # pi(L_g s)
-        if self.random:  # each row is one term of the sum, drawn with probability 1/N
+        if isinstance(rows, DrawnRows):  # each row is one term of the sum, drawn with probability 1/N
             with torch.no_grad():
                 label = act(deterministic_action(self._distribution(rows.td)), rows.element)
             return len(self.elements) * squared_distance(output, label).unsqueeze(-1)
@@ -248,7 +252,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         ):
             return self.actor_network.get_dist(td)
 
-    def _reduce(self, name: str, value: Tensor, rows: Rows) -> Tensor:
+    def _reduce(self, name: str, value: Tensor, rows: OrbitRows | DrawnRows) -> Tensor:
         if not name.startswith("loss_"):
             return value
         per_original = name in ("loss_entropy", "loss_mirror")

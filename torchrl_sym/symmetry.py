@@ -154,23 +154,36 @@ class Symmetry(nn.Module):
             raise ValueError(f"expected distinct element names, at least one, got {list(elements)}")
         return [0, *(g for g in named if g != 0)]
 
-    def forward(self, tensordict: TensorDictBase, g: int | str | Tensor) -> TensorDictBase:
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        g: int | str | Tensor,
+        *,
+        keys: Iterable[NestedKey] | None = None,
+    ) -> TensorDictBase:
         """Symmetric copy of a tensordict under one element, or one element per row.
 
         Args:
             tensordict: any batch; it is not modified.
             g: element index or name, or indices of shape ``tensordict.batch_size``.
+            keys: what to map; every other entry is shared. Defaults to all that is declared.
 
         Raises:
             KeyError: an entry that the symmetry should know but does not (strict).
             ValueError: a tensor's last dimension differs from its representation's.
         """
         out = tensordict.copy()
-        for key, representation, value in self._mapped(tensordict):
+        for key, representation, value in self._mapped(tensordict, keys):
             out.set(key, representation(value, g))
         return out
 
-    def orbit(self, tensordict: TensorDictBase, elements: Sequence[int] | None = None) -> TensorDictBase:
+    def orbit(
+        self,
+        tensordict: TensorDictBase,
+        elements: Sequence[int] | None = None,
+        *,
+        keys: Iterable[NestedKey] | None = None,
+    ) -> TensorDictBase:
         """All symmetric copies: batch ``[*B]`` to ``[N, *B]``, the originals first.
 
         Entries that copies share are expanded, not copied.
@@ -178,10 +191,11 @@ class Symmetry(nn.Module):
         Args:
             tensordict: any batch; it is not modified.
             elements: indices of the elements to apply. Defaults to all of the group.
+            keys: what to map; every other entry is shared. Defaults to all that is declared.
         """
         count = self.group.order if elements is None else len(elements)
         out = tensordict.expand(count, *tensordict.batch_size).copy()
-        for key, representation, value in self._mapped(tensordict):
+        for key, representation, value in self._mapped(tensordict, keys):
             if elements is None:
                 images = representation.orbit(value)
             else:
@@ -189,11 +203,11 @@ class Symmetry(nn.Module):
             out.set(key, images)
         return out
 
-    def _mapped(self, tensordict: TensorDictBase):
-        for key in tensordict.keys(include_nested=True, leaves_only=True):
+    def _mapped(self, tensordict: TensorDictBase, keys: Iterable[NestedKey] | None):
+        for key in tensordict.keys(include_nested=True, leaves_only=True) if keys is None else keys:
             representation = self._resolve(key)
             if representation is not None:
-                value = tensordict.get(key)
+                value = tensordict.get(key, None)
                 if isinstance(value, Tensor):
                     if value.ndim <= tensordict.batch_dims or value.shape[-1] != representation.dim:
                         raise ValueError(
