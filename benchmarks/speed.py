@@ -113,7 +113,7 @@ def measure_envs(arguments: Arguments) -> list[dict]:
     for task in tasks.ALL_TASKS:
         parallel = parallel_env_rate(task, arguments.rounds)
         for n in arguments.num_envs:
-            steps = max(4, 8192 // n)
+            steps = max(64, 16384 // n)  # long enough that switching variants does not show
             env = tasks.make_env(task, num_envs=n, num_threads=arguments.threads, seed=0)
             variants = {"raw": raw_physics(env, steps, arguments.threads), "env": stepping(env, steps)}
             seconds = interleave(variants, arguments.rounds)
