@@ -1,0 +1,277 @@
+"""Derive the symmetry of a robot from its MuJoCo model: which joint goes where, with which sign.
+
+Hand-written mirror tables are the most common bug of symmetric learning. `derive` finds them from the
+model: it matches the links at one pose that the group keeps, reads the signs off the joint axes, and checks
+that the result is a representation. It works for any joint order and any choice of body frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.coordinates import CoordinateMap, map_coordinates
+from torchrl_sym.mujoco.elements import (
+    Image,
+    SymmetryError,
+    map_actuators,
+    map_sites,
+    map_tendons,
+)
+from torchrl_sym.mujoco.links import Array, Matcher, MjModel, links_of, name_of, reference_pose
+from torchrl_sym.representations import Representation
+from torchrl_sym.representations.blocks import SignedPermutation
+
+Kind = Literal["joint", "actuator", "body", "site", "tendon"]
+
+
+def derive(
+    model: MjModel,
+    group: PointGroup,
+    keyframe: int | str | None = None,
+    *,
+    tolerance: float = 1e-2,
+) -> ModelSymmetry:
+    """How each element of a group acts on a model.
+
+    Args:
+        model: the compiled model.
+        group: the group to try; it acts about the vertical axis through the world's origin.
+        keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
+        tolerance: largest mismatch of a joint that still counts as its image's: 1 - cos of the angle
+            between the axes, plus the distance of the anchors relative to the model's extent.
+
+    Returns:
+        The action on joints, actuators, sites, tendons and the full state. Whether masses, ranges and
+        shapes agree as well is for :func:`~torchrl_sym.mujoco.audit` to say.
+
+    Raises:
+        SymmetryError: a joint, actuator or tendon has no image; the message names it.
+        ValueError: the group tilts gravity.
+        KeyError: no such keyframe.
+
+    Example:
+        >>> import mujoco
+        >>> from torchrl_sym import PointGroup
+        >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody>
+        ...   <body name="left" pos="0 .1 0"><joint name="left" axis="1 0 0"/><geom size=".1"/></body>
+        ...   <body name="right" pos="0 -.1 0"><joint name="right" axis="1 0 0"/><geom size=".1"/></body>
+        ... </worldbody></mujoco>''')
+        >>> robot = derive(model, PointGroup.reflection("y"))
+        >>> robot.table("joint", "reflect-y")
+        {'left': '-right', 'right': '-left'}
+    """
+    gravity = torch.as_tensor(np.array(model.opt.gravity))
+    for name, matrix in zip(group.names, group.matrices, strict=True):
+        if not torch.allclose(matrix @ gravity, gravity, atol=1e-9):
+            raise ValueError(
+                f"{name!r} tilts gravity {gravity.tolist()}; use a group that fixes the vertical axis, or "
+                "switch gravity off in the model"
+            )
+    data = reference_pose(model, keyframe)
+    links = links_of(model, data)
+    actions = []
+    for name, matrix in zip(group.names, group.matrices, strict=True):
+        matcher = Matcher(model, data, links, matrix.numpy())
+        images = matcher.links_to()
+        joints = _joint_images(model, matcher, images, name, tolerance)
+        actions.append(
+            _Action(model, matcher, map_coordinates(model, data, links, matcher, images, joints), tolerance)
+        )
+    return ModelSymmetry(model, group, actions)
+
+
+def _joint_images(
+    model: MjModel, matcher: Matcher, images: dict[int, int], element: str, tolerance: float
+) -> dict[int, int]:
+    """Image of every joint; SymmetryError if one is not where the symmetry sends it."""
+    joints: dict[int, int] = {}
+    for a, link in matcher.links.items():
+        mine = link.joints
+        b = images.get(a)
+        pairs = {} if b is None else matcher.joints_to(a, b)
+        if b is None or len(pairs) != len(mine):
+            raise SymmetryError(
+                f"{name_of(model, 'body', a)} has no image under {element!r}: no body with as many joints "
+                "and children is left on the other side"
+            )
+        for i, j in pairs.items():
+            misfit = matcher.joint_cost(i, j)
+            if misfit > tolerance:
+                raise SymmetryError(
+                    f"{name_of(model, 'joint', i)} has no image under {element!r}: the nearest, "
+                    f"{name_of(model, 'joint', j)}, misses it by {misfit:.2g} (axis and anchor; tolerance "
+                    f"{tolerance:g}); is the pose symmetric? pass keyframe=... for another one"
+                )
+        joints |= pairs
+    return joints
+
+
+class _Action:
+    """One element's action on everything in a model."""
+
+    def __init__(
+        self, model: MjModel, matcher: Matcher, coordinates: CoordinateMap, tolerance: float
+    ) -> None:
+        data = matcher.data
+        self.coordinates = coordinates
+        self.sites = map_sites(model, data, matcher, coordinates.bodies, tolerance)
+        self.tendons = map_tendons(model, coordinates, self.sites)
+        self.actuators = map_actuators(model, coordinates, self.sites, self.tendons)
+        self.ctrl, self.ctrl_offset = _scatter(self.actuators, model.nu)
+        self.act = np.zeros((model.na, model.na))
+        for a, image in self.actuators.items():
+            count = int(model.actuator_actnum[a])
+            if count > 0:
+                i, j = int(model.actuator_actadr[a]), int(model.actuator_actadr[image.index])
+                self.act[j : j + count, i : i + count] = image.sign * np.eye(count)
+
+
+def _scatter(images: dict[int, Image], size: int) -> tuple[Array, Array]:
+    matrix, offset = np.zeros((size, size)), np.zeros(size)
+    for a, image in images.items():
+        matrix[image.index, a] = image.sign
+        offset[image.index] = image.offset
+    return matrix, offset
+
+
+class ModelSymmetry:
+    """What :func:`derive` found: named tables, representations and full-state maps.
+
+    Attributes:
+        model: the model.
+        group: the group that acts on it.
+        joint_positions: representation of all hinge and slide coordinates, in the model's order,
+            relative to a pose that the group keeps.
+        joint_velocities: the same for their velocities.
+        actuators: representation of the controls, relative to such a pose.
+        qvel: representation of the full velocity; also of ``qacc_warmstart``.
+    """
+
+    def __init__(self, model: MjModel, group: PointGroup, actions: Sequence[_Action]) -> None:
+        self.model = model
+        self.group = group
+        self._actions = list(actions)
+        self._scalar = [j for j in range(model.njnt) if j in actions[0].coordinates.signs]
+        self.joint_positions = self._joint_representation(self._scalar)
+        self.joint_velocities = self.joint_positions
+        self.actuators = self._represent([action.ctrl for action in actions])
+        self.qvel = self._represent([action.coordinates.qvel for action in actions])
+        self._qpos = self._represent([action.coordinates.qpos for action in actions])
+        self._act = self._represent([action.act for action in actions])
+        self._mocap_position = self._represent([a.coordinates.mocap_position for a in actions])
+        self._mocap_rotation = self._represent([a.coordinates.mocap_rotation for a in actions])
+
+    def _represent(self, matrices: list[Array]) -> Representation:
+        if matrices[0].shape[0] == 0:
+            empty = torch.zeros(self.group.order, 0)
+            return Representation.from_blocks(self.group, [SignedPermutation(empty, empty)], check=False)
+        return Representation(self.group, torch.as_tensor(np.stack(matrices)))
+
+    def _joint_representation(self, joints: list[int]) -> Representation:
+        place = {j: i for i, j in enumerate(joints)}
+        matrices = []
+        for g, action in enumerate(self._actions):
+            matrix = np.zeros((len(joints), len(joints)))
+            for j in joints:
+                image = action.coordinates.joints[j]
+                if image not in place:
+                    raise ValueError(
+                        f"{self.group.names[g]!r} sends {name_of(self.model, 'joint', j)} to "
+                        f"{name_of(self.model, 'joint', image)}, which is not among the joints asked for; "
+                        "add it"
+                    )
+                matrix[place[image], place[j]] = action.coordinates.signs[j]
+            matrices.append(matrix)
+        return self._represent(matrices)
+
+    def joints(self, names: Sequence[str]) -> Representation:
+        """Representation of some hinge and slide joints, in the order of their names.
+
+        Raises:
+            KeyError: no such joint.
+            ValueError: an element sends one of them to a joint that is not among them.
+        """
+        known = {name_of(self.model, "joint", j): j for j in self._scalar}
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise KeyError(f"no hinge or slide joints {missing}; the model has {list(known)}")
+        return self._joint_representation([known[name] for name in names])
+
+    def table(self, kind: Kind, g: int | str) -> dict[str, str]:
+        """Where each named element goes: ``{"left": "-right"}`` reads "left's value becomes minus right's".
+
+        Args:
+            kind: ``"joint"``, ``"actuator"``, ``"body"``, ``"site"`` or ``"tendon"``.
+            g: element by index or name.
+        """
+        action = self._actions[self.group.index(g)]
+        signs = action.coordinates.signs
+        images = {
+            "joint": {a: Image(b, signs.get(a, 1.0)) for a, b in action.coordinates.joints.items()},
+            "actuator": action.actuators,
+            "body": {a: Image(b) for a, b in action.coordinates.bodies.items()},
+            "site": {a: Image(b) for a, b in action.sites.items()},
+            "tendon": action.tendons,
+        }
+        if kind not in images:
+            raise ValueError(f"expected one of {list(images)}, got {kind!r}")
+        return {
+            name_of(self.model, kind, a): "-" * (image.sign < 0) + name_of(self.model, kind, image.index)
+            for a, image in sorted(images[kind].items())
+        }
+
+    def offsets(self, g: int | str) -> dict[str, float]:
+        """Joints whose coordinate gets an offset, ``q' = sign q + offset``, by the name of the source."""
+        action = self._actions[self.group.index(g)]
+        return {
+            name_of(self.model, "joint", j): offset
+            for j, offset in action.coordinates.offsets.items()
+            if abs(offset) > 1e-12
+        }
+
+    def map_qpos(self, qpos: Tensor, g: int | str) -> Tensor:
+        """Image of positions ``(..., nq)``."""
+        g = self.group.index(g)
+        offset = torch.as_tensor(self._actions[g].coordinates.qpos_offset).to(qpos)
+        return self._qpos(qpos, g) + offset
+
+    def map_qvel(self, qvel: Tensor, g: int | str) -> Tensor:
+        """Image of velocities (or of ``qacc_warmstart``) ``(..., nv)``."""
+        return self.qvel(qvel, g)
+
+    def map_ctrl(self, ctrl: Tensor, g: int | str) -> Tensor:
+        """Image of controls ``(..., nu)``, in the units of the actuators."""
+        g = self.group.index(g)
+        return self.actuators(ctrl, g) + torch.as_tensor(self._actions[g].ctrl_offset).to(ctrl)
+
+    def map_act(self, act: Tensor, g: int | str) -> Tensor:
+        """Image of actuator states ``(..., na)``."""
+        return self._act(act, g)
+
+    def map_mocap(self, position: Tensor, rotation: Tensor, g: int | str) -> tuple[Tensor, Tensor]:
+        """Image of mocap poses ``(..., nmocap, 3)`` and ``(..., nmocap, 4)``."""
+        images = (
+            representation(x.flatten(-2), g).unflatten(-1, x.shape[-2:])
+            for representation, x in ((self._mocap_position, position), (self._mocap_rotation, rotation))
+        )
+        return next(images), next(images)
+
+    def __str__(self) -> str:
+        lines = [f"symmetry of {self.model.nbody - 1} bodies under {self.group!r}"]
+        for kind in ("joint", "actuator"):
+            tables = [self.table(kind, g) for g in range(self.group.order)]
+            if not tables[0]:
+                continue
+            header = [kind, *self.group.names[1:]]
+            rows = [[name, *(table[name] for table in tables[1:])] for name in tables[0]]
+            widths = [max(map(len, column)) for column in zip(header, *rows, strict=True)]
+            lines.append("")
+            for row in (header, *rows):
+                lines.append("  ".join(f"{c:<{w}s}" for c, w in zip(row, widths, strict=True)).rstrip())
+        return "\n".join(lines)
