@@ -4,7 +4,8 @@ With R the isometry, d its determinant, X_b the world rotation of body b at the 
 the image of link b, the part of the isometry that acts within the body frame is V_b = X_s(b)^T R X_b. Then
 
 - a hinge or slide coordinate becomes q'_s(j) = sign_j q_j + offset_j, with the sign from its axis;
-- a free joint's position becomes R p, its rotation R X V_b^-1, its velocities R v (world) and d V_b w (body);
+- a free joint's position becomes R p, its rotation R X V_b^-1, its velocities R v (world) and d V_b w
+  (body frame);
 - a ball joint's rotation, relative to its parent p, becomes B_s(b)^T V_p B_b X V_b^-1 with B_b the fixed
   rotation of b in p.
 
