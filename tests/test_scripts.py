@@ -74,8 +74,8 @@ def test_speed_writes_its_figures(tmp_path):
     assert {row["elements"] for row in results["augment"]} == {"all", "random"}
 
 
-@pytest.mark.parametrize("number", range(2))
+@pytest.mark.parametrize("number", range(3))
 def test_code_in_the_readme(number):
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), flags=re.DOTALL)
-    assert len(blocks) == 2
+    assert len(blocks) == 3
     exec(compile(blocks[number], "README.md", "exec"), {})

@@ -1,0 +1,109 @@
+"""Assertions for your own tests: is this a representation, is this network equivariant?
+
+They pass silently and fail with the element, entry and size of the worst violation. Equivariance is tested
+as mathematics, f(rho_in(g) x) = rho_out(g) f(x) for every element and random x, in the spirit of e3nn's
+``assert_equivariant``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_sym.representations import Representation, invariant
+
+
+def assert_representation(representation: Representation, *, tolerance: float = 1e-9) -> None:
+    """Fail unless rho(e) = 1, every rho(g) is orthogonal, and rho(g) rho(h) = rho(g h) for all pairs.
+
+    Args:
+        representation: what to check.
+        tolerance: largest entry of a difference that still counts as equal.
+
+    Raises:
+        AssertionError: with the element or pair at fault.
+
+    Example:
+        >>> from torchrl_sym import PointGroup
+        >>> from torchrl_sym.representations import polar
+        >>> assert_representation(polar(PointGroup.dihedral(3)))
+    """
+    group, matrices = representation.group, representation.matrices
+    eye = torch.eye(representation.dim, dtype=matrices.dtype)
+    residual = (matrices[0] - eye).abs().amax() if representation.dim else torch.zeros(())
+    assert residual <= tolerance, f"the identity acts as something else, off by {residual:.2g}"
+    for g, name in enumerate(group.names):
+        residual = (matrices[g] @ matrices[g].mT - eye).abs().max()
+        assert residual <= tolerance, f"{name!r} does not act orthogonally, off by {residual:.2g}"
+        for h, other in enumerate(group.names):
+            residual = (matrices[g] @ matrices[h] - matrices[int(group.table[g, h])]).abs().max()
+            assert residual <= tolerance, (
+                f"rho({name}) rho({other}) differs from rho({group.names[int(group.table[g, h])]}) by "
+                f"{residual:.2g}"
+            )
+
+
+def assert_equivariant(
+    module: Callable[[Tensor], Tensor],
+    in_rep: Representation,
+    out_rep: Representation | None = None,
+    *,
+    inputs: Tensor | None = None,
+    names: Sequence[str] | None = None,
+    tolerance: float = 1e-5,
+    seed: int = 0,
+) -> None:
+    """Fail unless f(rho_in(g) x) = rho_out(g) f(x) for every element.
+
+    Args:
+        module: maps ``(rows, in)`` to ``(rows, out)``; called without gradients.
+        in_rep: how its input transforms.
+        out_rep: how its output transforms. Defaults to invariance, as of a value function.
+        inputs: rows to test on. Defaults to 64 standard normal ones.
+        names: names of the output entries, for the message.
+        tolerance: largest difference allowed, relative to the largest output (or 1 if that is smaller).
+        seed: seed of the default inputs.
+
+    Raises:
+        AssertionError: with element, output entry and the two values that should agree.
+        ValueError: the output's size is not that of ``out_rep``.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_sym import PointGroup
+        >>> from torchrl_sym.representations import pseudoscalar
+        >>> sign = pseudoscalar(PointGroup.reflection("x"))
+        >>> assert_equivariant(torch.tanh, sign * 3, sign * 3)
+        >>> assert_equivariant(torch.cos, sign, sign)
+        Traceback (most recent call last):
+        ...
+        AssertionError: not equivariant under 'reflect-x': entry 0 of the output is ..., expected ...
+    """
+    if inputs is None:
+        generator = torch.Generator().manual_seed(seed)
+        inputs = torch.randn(64, in_rep.dim, generator=generator)
+    with torch.no_grad():
+        output = module(inputs)
+        if out_rep is None:
+            out_rep = invariant(in_rep.group, output.shape[-1])
+        if output.shape[-1] != out_rep.dim:
+            raise ValueError(
+                f"expected an output of size {out_rep.dim}, as of out_rep, got {tuple(output.shape)}"
+            )
+        bound = tolerance * max(1.0, float(output.abs().max()))
+        for g, element in enumerate(in_rep.group.names):
+            got, expected = module(in_rep(inputs, g)), out_rep(output, g)
+            difference = (got - expected).abs().reshape(-1, out_rep.dim)
+            worst = difference.amax(dim=0)  # per output entry; NaN counts as a violation
+            if not bool((worst <= bound).all()):
+                entry = int(worst.nan_to_num(torch.inf).argmax())
+                row = int(difference[:, entry].nan_to_num(torch.inf).argmax())
+                label = f" ({names[entry]})" if names is not None else ""
+                a, b = (x.reshape(-1, out_rep.dim)[row, entry].item() for x in (got, expected))
+                raise AssertionError(
+                    f"not equivariant under {element!r}: entry {entry}{label} of the output is {a:.4g} on "
+                    f"the mapped input, expected {b:.4g}; {int((worst > bound).sum())} of {out_rep.dim} "
+                    f"entries differ, the largest by {float(worst[entry]):.2g}"
+                )
