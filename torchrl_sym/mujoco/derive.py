@@ -7,6 +7,7 @@ that the result is a representation. It works for any joint order and any choice
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -24,10 +25,11 @@ from torchrl_sym.mujoco.elements import (
     map_tendons,
 )
 from torchrl_sym.mujoco.links import Array, Matcher, MjModel, links_of, name_of, reference_pose
+from torchrl_sym.mujoco.sensors import SensorMap, SensorMapper, sensor_matrices
 from torchrl_sym.representations import Representation
 from torchrl_sym.representations.blocks import SignedPermutation
 
-Kind = Literal["joint", "actuator", "body", "site", "tendon"]
+Kind = Literal["joint", "actuator", "body", "site", "tendon", "sensor"]
 
 
 def derive(
@@ -118,7 +120,8 @@ class _Action:
     def __init__(
         self, model: MjModel, matcher: Matcher, coordinates: CoordinateMap, tolerance: float
     ) -> None:
-        data = matcher.data
+        self.data = data = matcher.data
+        self.tolerance = tolerance
         self.coordinates = coordinates
         self.sites = map_sites(model, data, matcher, coordinates.bodies, tolerance)
         self.tendons = map_tendons(model, coordinates, self.sites)
@@ -203,11 +206,45 @@ class ModelSymmetry:
             raise KeyError(f"no hinge or slide joints {missing}; the model has {list(known)}")
         return self._joint_representation([known[name] for name in names])
 
+    @functools.cached_property
+    def _sensors(self) -> list[SensorMap]:
+        return [
+            SensorMapper(
+                self.model, a.data, matrix.numpy(), a.coordinates, a.tendons, a.actuators, a.tolerance
+            ).map()
+            for a, matrix in zip(self._actions, self.group.matrices, strict=True)
+        ]
+
+    @functools.cached_property
+    def sensordata(self) -> Representation:
+        """Representation of all sensor readings, ``mjData.sensordata``; quaternions up to their sign.
+
+        Raises:
+            ValueError: a sensor's reading has no linear image; the message names it and says why.
+        """
+        return self._sensor_representation(range(self.model.nsensor))
+
+    def sensors(self, names: Sequence[str]) -> Representation:
+        """Representation of the readings of some sensors, in the order of their names.
+
+        Raises:
+            KeyError: no such sensor.
+            ValueError: a reading has no linear image, or an element sends a sensor to one not named.
+        """
+        known = {name_of(self.model, "sensor", i): i for i in range(self.model.nsensor)}
+        missing = [name for name in names if name not in known]
+        if missing:
+            raise KeyError(f"no sensors {missing}; the model has {list(known)}")
+        return self._sensor_representation([known[name] for name in names])
+
+    def _sensor_representation(self, sensors: Sequence[int]) -> Representation:
+        return self._represent(sensor_matrices(self.model, self._sensors, sensors, self.group.names))
+
     def table(self, kind: Kind, g: int | str) -> dict[str, str]:
         """Where each named element goes: ``{"left": "-right"}`` reads "left's value becomes minus right's".
 
         Args:
-            kind: ``"joint"``, ``"actuator"``, ``"body"``, ``"site"`` or ``"tendon"``.
+            kind: ``"joint"``, ``"actuator"``, ``"body"``, ``"site"``, ``"tendon"`` or ``"sensor"``.
             g: element by index or name.
         """
         action = self._actions[self.group.index(g)]
@@ -218,6 +255,7 @@ class ModelSymmetry:
             "body": {a: Image(b) for a, b in action.coordinates.bodies.items()},
             "site": {a: Image(b) for a, b in action.sites.items()},
             "tendon": action.tendons,
+            "sensor": self._sensors[self.group.index(g)].images if kind == "sensor" else {},
         }
         if kind not in images:
             raise ValueError(f"expected one of {list(images)}, got {kind!r}")
