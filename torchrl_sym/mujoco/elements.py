@@ -156,6 +156,13 @@ def _transmission_sign(
             f"{name_of(model, 'actuator', a)} has a transmission of an unsupported kind; supported are "
             f"{sorted(set(_TRANSMISSION.values()))}"
         )
+    has_reference = kind == "site" and int(model.actuator_trnid[a, 1]) >= 0
+    in_parent = kind == "jointinparent" and _dofs(model, int(model.actuator_trnid[a, 0])) > 1
+    if has_reference or in_parent:
+        raise SymmetryError(
+            f"{name_of(model, 'actuator', a)} acts in another frame (a reference site, the parent of a ball "
+            "or free joint), which is not supported; use a joint or a plain site transmission"
+        )
     if int(model.actuator_trntype[b]) != int(model.actuator_trntype[a]):
         return None
     target, other = int(model.actuator_trnid[a, 0]), int(model.actuator_trnid[b, 0])
