@@ -257,6 +257,12 @@ def test_a_group_that_does_not_fit_is_a_verdict_not_a_crash():
         audit(robot("K4"), K4, "home")
 
 
+def test_a_site_that_nothing_uses_is_a_warning():
+    report = audit(robot("C2", {"extra": '<site name="mark" pos="0 0 .1"/>'}), C2)
+    assert report.exact
+    assert "1 sites are out of place (mark (no image))" in report.warnings[0]
+
+
 def test_wind_counts_in_a_fluid_only():
     assert audit(robot("C2", option='cone="elliptic" wind="1 0 0"'), C2).exact
     blown = audit(robot("C2", option='cone="elliptic" wind="1 0 0" density="1.2"'), C2)

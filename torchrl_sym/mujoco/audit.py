@@ -80,10 +80,9 @@ def audit(
         rows += [Residual(name, term, worst, part) for term, (worst, part) in run.worst.items()]
         unchecked += tuple(text for text in run.unchecked if text not in unchecked)
     if loose:
-        text = (
-            f"sites {list(loose)} are out of place; nothing in the model uses them, but do not observe them"
-        )
-        warnings += (text,)
+        shown = ", ".join(list(loose)[:4]) + ", ..." * (len(loose) > 4)
+        text = f"{len(loose)} sites are out of place ({shown}); nothing in the model uses them, so do not"
+        warnings += (f"{text} observe them",)
     report = AuditReport(elements, tuple(rows), tolerance, None, warnings, unchecked)
     if report.worst is None or report.worst.residual <= NOT_A_SYMMETRY:
         return report
