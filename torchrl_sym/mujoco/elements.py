@@ -160,7 +160,7 @@ def _transmission_sign(
     in_parent = kind == "jointinparent" and _dofs(model, int(model.actuator_trnid[a, 0])) > 1
     if has_reference or in_parent:
         raise SymmetryError(
-            f"{name_of(model, 'actuator', a)} acts in another frame (a reference site, the parent of a ball "
+            f"{name_of(model, 'actuator', a)} acts in another frame (reference site, or parent of a ball "
             "or free joint), which is not supported; use a joint or a plain site transmission"
         )
     if int(model.actuator_trntype[b]) != int(model.actuator_trntype[a]):
