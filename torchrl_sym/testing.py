@@ -8,11 +8,13 @@ as mathematics, f(rho_in(g) x) = rho_out(g) f(x) for every element and random x,
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchrl_sym.representations import Representation, invariant
+from torchrl_sym.symmetry import Symmetry
 
 
 def assert_representation(representation: Representation, *, tolerance: float = 1e-9) -> None:
@@ -107,3 +109,30 @@ def assert_equivariant(
                     f"the mapped input, expected {b:.4g}; {int((worst > bound).sum())} of {out_rep.dim} "
                     f"entries differ, the largest by {float(worst[entry]):.2g}"
                 )
+
+
+def assert_env_symmetric(env: Any, symmetry: Symmetry, **verify_kwargs: Any) -> None:
+    """Fail unless a MuJoCo-backed environment has the symmetry declared for it.
+
+    Args:
+        env: as :func:`~torchrl_sym.mujoco.verify` takes it.
+        symmetry: how its observation and action transform.
+        **verify_kwargs: arguments of ``verify``.
+
+    Raises:
+        AssertionError: with the part, element and entry or joint at fault, and the whole table.
+
+    Example:
+        >>> import tasks
+        >>> env = tasks.make_env("cartpole", num_envs=16, num_threads=1)
+        >>> assert_env_symmetric(env, env.symmetry)
+    """
+    from torchrl_sym.mujoco.verify import verify  # only this assertion needs MuJoCo
+
+    report = verify(env, symmetry, **verify_kwargs)
+    if not report.passed:
+        row = report.worst
+        raise AssertionError(
+            f"not symmetric under {row.element!r}: {row.part} is off by {row.value:.2g} (limit "
+            f"{row.limit:.2g}) at {row.where}\n\n{report}"
+        )

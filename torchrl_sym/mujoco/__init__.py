@@ -1,8 +1,9 @@
-"""Symmetry of MuJoCo models: derive it, audit it."""
+"""Symmetry of MuJoCo models: derive it, audit it, verify it."""
 
 from torchrl_sym.mujoco.audit import audit
 from torchrl_sym.mujoco.derive import ModelSymmetry, derive
 from torchrl_sym.mujoco.elements import SymmetryError
 from torchrl_sym.mujoco.report import AuditReport
+from torchrl_sym.mujoco.verify import VerifyReport, verify
 
-__all__ = ["AuditReport", "ModelSymmetry", "SymmetryError", "audit", "derive"]
+__all__ = ["AuditReport", "ModelSymmetry", "SymmetryError", "VerifyReport", "audit", "derive", "verify"]
