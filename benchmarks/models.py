@@ -28,10 +28,11 @@ GROUPS = {
 }
 HEADER = """# Which symmetries public models have
 
-Made by `python benchmarks/models.py`: `derive` and `audit` of each model at its reference pose. *exact*: every
-term agrees to 1e-8, so that the simulator commutes with the element. *approximate*: the largest residual and
-where it is. *no*: the first thing that has no counterpart. Planar models (cart-pole, cheetah, walker, ...) do not
-move along y, so that reflect-y changes nothing in most of them; in the walker it exchanges the legs.
+Made by `python benchmarks/models.py`: `derive` and `audit` of each model at its reference pose. *exact*:
+every term agrees to 1e-8, so that the simulator commutes with the element. *approximate*: the largest
+residual and where it is. *no*: the first thing that has no counterpart. Planar models (cart-pole, cheetah,
+walker, ...) do not move along y, so that reflect-y changes nothing in most of them; in the walker it
+exchanges the legs.
 """
 
 
