@@ -4,6 +4,7 @@ import importlib.util
 import sys
 import types
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 import tasks
 from tasks.cartpole import CartPole
 from tasks.environment import BatchedEnv
+from tasks.state import State
 from torchrl_sym import PointGroup, Representation, Symmetry
 from torchrl_sym.mujoco import derive, verify
 from torchrl_sym.mujoco.verify import PARTS
@@ -60,6 +62,11 @@ def test_our_cartpole_is_exactly_symmetric():
     assert {row.element for row in states} == set(MIRROR.names)
     assert all(row.value == 0 for row in states)
     assert {row.part for row in report.rows} == set(PARTS)
+
+
+def test_our_cartpole_in_dm_control():
+    report = verify(tasks.load("cartpole", random=0), cartpole().symmetry)
+    assert report.passed, str(report)
 
 
 @pytest.mark.parametrize("name", SUITE)
@@ -125,6 +132,23 @@ def test_asymmetric_scales_in_a_wrapper_are_found(make_ant):
     # their own entries and those of their images: hip 3 and ankle 4
     assert worst.where.startswith("observation[")
     assert worst.where.endswith("(wrong: 6-7, 9, 12)")
+
+
+def test_slippery_foot_is_contact(make_ant):
+    env = make_ant()
+    model = env.unwrapped.model
+    model.geom_friction[model.geom("left_ankle_geom").id, 0] = 3.0
+    report = verify(env, ant_symmetry(env, "y"), states=32)
+    assert (report.worst.part, report.worst.element) == ("contact", "reflect-y")
+    assert all(row.passed for row in report.of("dynamics"))
+
+
+def test_heavy_leg_is_dynamics(make_ant):
+    env = make_ant()
+    env.unwrapped.model.body_mass[4] *= 1.01
+    report = verify(env, ant_symmetry(env, "y"), states=2)
+    assert (report.worst.part, report.worst.element) == ("dynamics", "reflect-y")
+    assert report.worst.where.startswith("joint ")
 
 
 def test_wrong_action_sign_is_dynamics():
@@ -220,6 +244,46 @@ def test_hidden_state_fails_the_identity():
     env = cartpole(Hidden)
     report = verify(env, env.symmetry, states=1)
     assert any(row.element == "identity" and not row.passed for row in report.of("contact"))
+
+
+def test_quaternions_count_up_to_sign():
+    """A task may return -q for q: the same orientation."""
+
+    class Tumbling(CartPole):
+        sign = 1.0
+
+        def __init__(self):
+            super().__init__()
+            self.model = mujoco.MjModel.from_xml_string("""<mujoco>
+              <option timestep="0.01"/><worldbody><body pos="0 0 1"><freejoint name="root"/>
+              <geom size=".1 .2 .3" type="box"/></body></worldbody></mujoco>""")
+            group = self.symmetry.group
+            self.position = polar(group) + quaternion(group, "conjugate")
+            self.velocity = polar(group) + axial(group)
+            self.symmetry = Symmetry(group, {"observation": polar(group), "action": signs("-")})
+
+        def sample_goal_state(self, n, generator):
+            qpos = torch.randn(n, 7, generator=generator, dtype=torch.float64)
+            qpos[:, 3:] /= qpos[:, 3:].norm(dim=1, keepdim=True)
+            return State(qpos, torch.randn(n, 6, generator=generator, dtype=torch.float64))
+
+        def control(self, action, state):
+            return torch.zeros(len(state), 0, dtype=torch.float64)
+
+        def observe(self, state):
+            return state.qpos[:, :3].clone()
+
+        def reward(self, state, action):
+            return state.qpos[:, 2].clone()
+
+        def transform_state(self, state, g):
+            self.sign = -self.sign  # another choice each time
+            sign = torch.tensor([1.0] * 3 + [self.sign] * 4)
+            return State(sign * self.position(state.qpos, g), self.velocity(state.qvel, g), time=state.time)
+
+    env = cartpole(Tumbling)
+    report = verify(env, env.symmetry)
+    assert report.passed, str(report)
 
 
 def test_assertion_names_the_worst():

@@ -25,9 +25,10 @@ from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
 from torchrl_sym.mujoco.subjects import Observation, Outcome, Subject, subject_of, write_state
 from torchrl_sym.symmetry import Symmetry
 
-# In the order of cause: a wrong part makes those after it wrong as well.
+# In the order of cause: a wrong part makes those after it wrong as well. States come before observations,
+# which may contain forces, and on which no state depends.
 PARTS = (
-    *("kinematics", "action box", "dynamics", "contact", "reward", "termination"),
+    *("action box", "dynamics", "contact", "kinematics", "reward", "termination"),
     *("next observation", "rollout", "reset"),
 )
 MAX_WARM_UP = 50  # random actions before a state is tested
@@ -126,11 +127,11 @@ def verify(
     the environment is stepped with random actions and their images. The identity is tested too: it fails
     if something that decides the future is not part of the state. The parts, in the order of cause:
 
-    - ``"kinematics"``: the observation of the image is the image of the observation, by entry;
     - ``"action box"``: K_g maps the bounds of the actions onto themselves, by entry;
     - ``"dynamics"``: one ``mj_step`` of the model with contact switched off, by joint;
     - ``"contact"``: one step of the environment with everything switched on, by joint; if this fails
       and ``"dynamics"`` does not, contact is to blame;
+    - ``"kinematics"``: the observation of the image is the image of the observation, by entry;
     - ``"reward"``, ``"termination"`` and ``"next observation"`` of that step;
     - ``"rollout"``: the state after ``steps`` steps, by joint; reported, never a failure, since contact
       amplifies rounding;
