@@ -76,6 +76,25 @@ def test_dm_control_suite_is_symmetric(name):
     assert all(row.value < 1e-12 for part in ("dynamics", "contact") for row in report.of(part))
 
 
+def test_states_alone_of_a_humanoid_in_contact():
+    env = load("humanoid stand")
+    group = PointGroup.reflection("y")
+    actuators = derive(env.physics.model.ptr, group).actuators
+    report = verify(env, Symmetry(group, {"action": actuators}, strict=False), states=8)
+    assert report.passed, str(report)
+    assert report.contacts > 0
+    assert not report.of("kinematics")
+    assert all(row.value < 1e-9 for part in ("dynamics", "contact") for row in report.of(part))
+
+
+def test_target_kept_outside_the_state_shows_in_the_reward():
+    env = load("reacher easy")  # it moves a geom of the model
+    group = PointGroup.reflection("y")
+    actuators = derive(env.physics.model.ptr, group).actuators
+    report = verify(env, Symmetry(group, {"action": actuators}, strict=False))
+    assert {row.part for row in report.rows if not row.passed} == {"reward"}
+
+
 @pytest.fixture
 def make_ant(monkeypatch):
     gymnasium = pytest.importorskip("gymnasium")

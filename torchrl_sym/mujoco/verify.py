@@ -140,9 +140,10 @@ def verify(
     Args:
         env: a batched task environment (``reset_to``, ``task.transform_state``), a dm_control
             ``Environment`` or a gymnasium ``MujocoEnv``. It is reset, seeded and stepped. Of the last two
-            only the state of MuJoCo is mapped, through :func:`~torchrl_sym.mujoco.derive`.
+            only the state of MuJoCo is mapped, through :func:`~torchrl_sym.mujoco.derive`: a target
+            that the task keeps elsewhere, such as a moved geom, stays put and shows as a residual.
         symmetry: representations of the observation's entries (``"observation"`` for an array) and of
-            ``"action"``.
+            ``"action"``. If it is not strict, entries it does not declare are not tested.
         keyframe: symmetric pose for ``derive``. Defaults to ``qpos0``.
         states: number of states, rounded up to whole batches; of a batch larger than this, contact-free
             dynamics are tested on so many rows.
