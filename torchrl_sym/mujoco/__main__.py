@@ -16,6 +16,7 @@ from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.audit import audit
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.links import mj
+from torchrl_sym.mujoco.symmetrize import symmetrize_with_report
 
 GROUPS = {
     "reflect-x": lambda: PointGroup.reflection("x"),
@@ -34,6 +35,8 @@ class Arguments:
     """reflect-x, reflect-y (left and right), klein_four, rotation-N or dihedral-N."""
     keyframe: str | None = None
     """A pose that the group keeps, by name; the model's reference pose by default."""
+    out: Path | None = None
+    """Where to write the model with everything averaged over the group (MJCF)."""
 
 
 def named_group(name: str) -> PointGroup:
@@ -64,6 +67,11 @@ def main(arguments: Arguments) -> int:
     except ValueError:  # the report says why
         tables = ""
     sys.stdout.write(f"{tables}{report}\n")
+    if arguments.out is not None and report.reason is None:
+        spec = mj.MjSpec.from_file(str(arguments.model))
+        spec, changes = symmetrize_with_report(spec, group, arguments.keyframe)
+        arguments.out.write_text(spec.to_xml())
+        sys.stdout.write(f"\n{changes}\n\nwritten to {arguments.out}\n")
     return 0 if report.reason is None else 1
 
 
