@@ -179,3 +179,16 @@ def test_shapes_given_by_their_ends_keep_their_place():
     assert np.allclose(after.geom_pos, spec.compile().geom_pos, atol=1e-12)
     assert np.allclose(after.geom_size, spec.compile().geom_size, atol=1e-12)
     assert after.body_mass[1:] == pytest.approx([1.05, 1.05])
+
+
+def test_free_body_away_from_the_centre_stays_there():
+    spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+      <body name="cube" pos="1 2 .1"><freejoint/><geom type="box" size=".1 .1 .1" pos="0 .002 0"/></body>
+      </worldbody></mujoco>""")
+    after, report = symmetrize_with_report(spec, K4)
+    compiled = after.compile()
+    assert compiled.qpos0[:3] == pytest.approx([1, 2, 0.1])
+    assert {change.term for change in report.changes} == {"centre of mass", "geom position"}
+    assert np.abs(compiled.body_ipos[1]).max() < 1e-12
+    assert np.abs(compiled.geom_pos[1]).max() < 1e-12
+    assert worst_step(compiled, K4) <= 1e-9

@@ -73,6 +73,9 @@ def symmetrize_with_report(
     contact pairs. Bodies and sites keep their rotation. A link of several welded bodies whose inertia
     changes gets it on the body that moves, and the others become massless.
 
+    Compile the result where exactness matters: ``to_xml`` rounds numbers, and a model read back from it is
+    symmetric to about five digits.
+
     Args:
         spec: the model; it is not modified.
         group: the group that the model nearly has, about the vertical through the world's origin.
@@ -228,11 +231,16 @@ class _Averager(Averager):
     def _geoms(self) -> None:
         model = self.model
         self.frames = self.data.geom_xmat.reshape(-1, 3, 3)
+        owner = model.body_weldid[model.geom_bodyid]
+        # geoms go along with their links, which have moved to symmetric places in their trees by now
+        links = [int(b) for b in owner]
+        moved = np.array([self.moved[b] - self.shift[b] for b in links]).reshape(-1, 3)
+        self.centers = self.data.geom_xpos + moved
+        self.offsets = self.centers - np.array([self.origin[b] for b in links]).reshape(-1, 3)
         maps = self._closed([self._match_geoms(g) for g in range(len(self.turns))], "geom")
         self._unsigned(maps, "geom", {name: getattr(model, f"geom_{name}") for name in _GEOM_FIELDS})
         maps = [{a: b for a, b in m.items() if int(model.geom_type[a]) in _PRIMITIVE} for m in maps]
-        owner = model.body_weldid[model.geom_bodyid]
-        places = self._points(maps, self.data.geom_xpos, lambda a: int(owner[a]))
+        places = self._points(maps, self.centers, lambda a: links[a])
         turns = self._mean(maps, lambda g, a: self._alignment(g, a, maps[g][a])[0])
         sizes = self._mean(maps, lambda g, a: self._alignment(g, a, maps[g][a])[1])
         for b, place in places.items():
@@ -266,16 +274,17 @@ class _Averager(Averager):
 
     def _misfit(self, g: int, a: int, b: int) -> float:
         """Distance of geom a's image from geom b relative to the extent; large if they do not fit."""
-        model, data = self.model, self.data
+        model = self.model
         same = all(getattr(model, f"geom_{n}")[a] == getattr(model, f"geom_{n}")[b] for n in _SAME)
-        offset = self.turns[g] @ data.geom_xpos[a] - data.geom_xpos[b]
+        offset = self.turns[g] @ self.offsets[a] - self.offsets[b]
         if int(model.geom_type[a]) == _PLANE:
             offset = offset @ self.frames[b][:, 2]
         if not same or int(model.geom_type[a]) not in _PRIMITIVE:
             return float(np.linalg.norm(offset)) / self.extent if same else 1e3
         frame, size = self._alignment(g, a, b)
         reach = np.abs(frame - self.frames[b])[:, 2 * (model.geom_type[a] in _ROUND) :].max() * size.max()
-        return float(np.linalg.norm(offset) + reach + np.abs(size - model.geom_size[b]).max()) / self.extent
+        growth = float(np.abs(size - model.geom_size[b]).max())
+        return max(float(np.linalg.norm(offset)), float(reach), growth) / self.extent
 
     def _alignment(self, g: int, a: int, b: int) -> tuple[Array, Array]:
         """Image of a's frame, its axes renamed and turned round to be near those of b; sizes likewise."""
