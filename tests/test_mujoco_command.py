@@ -4,8 +4,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mujoco
 import pytest
 
+from torchrl_sym import PointGroup
+from torchrl_sym.mujoco import audit
 from torchrl_sym.mujoco.__main__ import Arguments, main, named_group
 
 ROOT = Path(__file__).parents[1]
@@ -52,3 +55,10 @@ def test_groups_by_name(name, order):
 def test_unknown_groups_list_the_known_ones(name):
     with pytest.raises(ValueError, match=r"expected one of \['reflect-x'.*got"):
         named_group(name)
+
+
+def test_symmetrised_model_is_written_and_exact(pair, tmp_path, capsys):
+    out = tmp_path / "symmetric.xml"
+    assert main(Arguments(pair(1.02), out=out)) == 0
+    assert "written to" in capsys.readouterr().out
+    assert audit(mujoco.MjModel.from_xml_path(str(out)), PointGroup.reflection("y")).exact
