@@ -36,7 +36,7 @@ class Arguments:
     keyframe: str | None = None
     """A pose that the group keeps, by name; the model's reference pose by default."""
     out: Path | None = None
-    """Where to write the model with everything averaged over the group (MJCF)."""
+    """Where to write the model with everything averaged over the group (MJCF, six digits)."""
 
 
 def named_group(name: str) -> PointGroup:
@@ -71,7 +71,11 @@ def main(arguments: Arguments) -> int:
         spec = mj.MjSpec.from_file(str(arguments.model))
         spec, changes = symmetrize_with_report(spec, group, arguments.keyframe)
         arguments.out.write_text(spec.to_xml())
-        sys.stdout.write(f"\n{changes}\n\nwritten to {arguments.out}\n")
+        written = audit(mj.MjModel.from_xml_path(str(arguments.out)), group, arguments.keyframe)
+        sys.stdout.write(
+            f"\n{changes}\n\nwritten to {arguments.out}: {written.verdict}\n"
+            "(MJCF is written with six digits; for an exact model compile what symmetrize returns)\n"
+        )
     return 0 if report.reason is None else 1
 
 

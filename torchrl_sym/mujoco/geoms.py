@@ -132,6 +132,8 @@ def active_geoms(model: MjModel) -> NDArray[np.intp]:
 
 def audit_geoms(model: MjModel, data: MjData, matcher: Matcher, bodies: dict[int, int], add: Add) -> None:
     """Residuals of shapes, contact parameters, collision bits, excludes and explicit pairs."""
+    if model.ngeom == 0:
+        return
     active = active_geoms(model)
     images = _geom_images(model, data, matcher, bodies, active, add)
     for term, fields in _PARAMETERS.items():
