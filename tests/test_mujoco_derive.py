@@ -284,3 +284,22 @@ def test_actuators_in_other_frames_are_refused(actuator):
       <site name="a"/></body></worldbody><actuator><general name="m" {actuator}/></actuator></mujoco>"""
     with pytest.raises(SymmetryError, match="m acts in another frame"):
         derive(mujoco.MjModel.from_xml_string(xml), PointGroup.reflection("y"))
+
+
+def test_thrusters_on_welded_mounts_are_mapped_by_where_they_point():
+    def mount(
+        name: str, side: int, last: str
+    ) -> str:  # the same place and direction, however it is written
+        return f"""<body name="{name}" pos=".3 {0.2 * side} 0" euler="{40 * side} 0 0"><geom size=".05"/>
+          <body pos="0 0 .1" euler="0 30 0"><body pos="0 0 .1" euler="{20 * side} 25 0">{last}</body></body>
+          </body>"""
+
+    mounts = mount("left", 1, '<site name="left" euler="35 0 0"/>')
+    mounts += mount("right", -1, '<body euler="-35 0 0"><site name="right"/></body>')
+    xml = f"""<mujoco><worldbody><body name="hull" pos="0 0 1"><freejoint/><geom size=".1"/>{mounts}</body>
+      </worldbody><actuator><motor name="left" site="left" gear="0 0 1 0 0 .5"/>
+      <motor name="right" site="right" gear="0 0 -1 0 0 .5"/></actuator></mujoco>"""
+    compiled = mujoco.MjModel.from_xml_string(xml)
+    robot = derive(compiled, PointGroup.reflection("y"))
+    assert robot.table("actuator", 1) == {"left": "-right", "right": "-left"}
+    assert max(step_residual(compiled, robot, 1, seed)[0] for seed in range(4)) <= 1e-9

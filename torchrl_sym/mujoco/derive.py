@@ -125,7 +125,7 @@ class _Action:
         self.coordinates = coordinates
         self.sites = map_sites(model, data, matcher, coordinates.bodies, tolerance)
         self.tendons = map_tendons(model, coordinates, self.sites)
-        self.actuators = map_actuators(model, coordinates, self.sites, self.tendons)
+        self.actuators = map_actuators(matcher, coordinates, self.sites, self.tendons)
         self.ctrl, self.ctrl_offset = _scatter(self.actuators, model.nu)
         self.act = np.zeros((model.na, model.na))
         for a, image in self.actuators.items():

@@ -112,7 +112,7 @@ def _same_path(path: list[tuple], other: list[tuple]) -> bool:
 
 
 def map_actuators(
-    model: MjModel,
+    matcher: Matcher,
     map_: CoordinateMap,
     sites: dict[int, int],
     tendons: dict[int, Image],
@@ -123,11 +123,12 @@ def map_actuators(
         SymmetryError: an actuator's transmission is of an unsupported kind, or no actuator drives the
             image of what it drives.
     """
+    model = matcher.model
     images: dict[int, Image] = {}
     for a in range(model.nu):
         fits = []
         for b in range(model.nu):
-            sign = _transmission_sign(model, map_, sites, tendons, a, b)
+            sign = _transmission_sign(matcher, map_, sites, tendons, a, b)
             if sign is not None:
                 fits.append((_gain_distance(model, a, b), b != a, b, sign))
         free = [fit for fit in sorted(fits) if fit[2] not in {image.index for image in images.values()}]
@@ -142,7 +143,7 @@ def map_actuators(
 
 
 def _transmission_sign(
-    model: MjModel,
+    matcher: Matcher,
     map_: CoordinateMap,
     sites: dict[int, int],
     tendons: dict[int, Image],
@@ -150,6 +151,7 @@ def _transmission_sign(
     b: int,
 ) -> float | None:
     """Sign between actuator a's image and actuator b, None if b does not drive a's image."""
+    model = matcher.model
     kind = _TRANSMISSION.get(int(model.actuator_trntype[a]))
     if kind is None:
         raise SymmetryError(
@@ -180,7 +182,7 @@ def _transmission_sign(
     if kind == "site":
         if sites.get(target) != other:
             return None
-        frame = site_frame(model, map_, target, other)
+        frame = _site_frame(matcher, target, other)
         torque = round(float(np.linalg.det(frame))) * frame @ gear[3:]
         return _parallel(np.concatenate([frame @ gear[:3], torque]), gear_other)
     if map_.joints.get(target) != other:
@@ -197,24 +199,10 @@ def _dofs(model: MjModel, joint: int) -> int:
     return {FREE: 6, BALL: 3}.get(int(model.jnt_type[joint]), 1)
 
 
-def site_frame(model: MjModel, map_: CoordinateMap, a: int, b: int) -> Array:
+def _site_frame(matcher: Matcher, a: int, b: int) -> Array:
     """V of a site: how a polar vector in the frame of site a becomes one in the frame of its image b."""
-    link = int(model.body_weldid[model.site_bodyid[a]])
-    one, other = _site_rotation(model, a), _site_rotation(model, b)
-    return other.T @ map_.frames[link] @ one
-
-
-def _site_rotation(model: MjModel, site: int) -> Array:
-    """Rotation of a site in the frame of its link."""
-    matrix = np.zeros(9)
-    mj.mju_quat2Mat(matrix, model.site_quat[site])
-    out = matrix.reshape(3, 3)
-    body = int(model.site_bodyid[site])
-    while body != int(model.body_weldid[body]):
-        mj.mju_quat2Mat(matrix, model.body_quat[body])
-        out = matrix.reshape(3, 3) @ out
-        body = int(model.body_parentid[body])
-    return out
+    one, other = (matcher.data.site_xmat[site].reshape(3, 3) for site in (a, b))
+    return other.T @ matcher.matrix @ one
 
 
 def _parallel(image: Array, target: Array) -> float | None:
