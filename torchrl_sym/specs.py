@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey
 from tensordict.utils import unravel_key
+from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import Compose, EnvBase, TransformedEnv, VecNorm, VecNormV2
@@ -36,11 +37,7 @@ def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) 
         if row.isnan().any():
             raise ValueError(f"{key!r}: expected a box of numbers, got NaN in its bounds")
         row_low, row_high = row.chunk(2)
-        # image of an interval under a matrix; 0 * inf counts as 0
-        at_low = torch.where(matrices == 0, 0.0, matrices * row_low)
-        at_high = torch.where(matrices == 0, 0.0, matrices * row_high)
-        image_low = torch.minimum(at_low, at_high).sum(-1)  # (N, d)
-        image_high = torch.maximum(at_low, at_high).sum(-1)
+        image_low, image_high = image_of_box(matrices, row_low, row_high)  # (N, d)
         wrong = ~(
             torch.isclose(image_low, row_low, atol=1e-6) & torch.isclose(image_high, row_high, atol=1e-6)
         )
@@ -52,6 +49,12 @@ def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) 
                 f"[{image_low[g, i]:g}, {image_high[g, i]:g}]; make the box symmetric (actions relative "
                 "to a symmetric default pose, equal limits on both sides)"
             )
+
+
+def image_of_box(matrices: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Bounds of the images of a box ``(d,)`` under matrices ``(..., d, d)``; 0 * inf counts as 0."""
+    ends = [torch.where(matrices == 0, 0.0, matrices * bound) for bound in (low, high)]
+    return torch.minimum(*ends).sum(-1), torch.maximum(*ends).sum(-1)
 
 
 def check_normalizers(env: EnvBase, keys: Sequence[NestedKey]) -> None:

@@ -117,7 +117,7 @@ class SymmetryAugment(Transform):
         if self.when != "sample" or tensordict.batch_dims == 0:
             return tensordict
         if not torch.compiler.is_compiling():
-            self._check_sampling(_calling_buffer())
+            self._check_sampling(_calling_buffer()[0])
         return self.augment(tensordict)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -228,8 +228,7 @@ class SymmetryAugment(Transform):
                     "collector's trajectory ids and the sampler's default keys, or use when='sample'"
                 )
 
-    def _check_sampling(self, caller: tuple[ReplayBuffer | None, str]) -> None:
-        buffer, _ = caller
+    def _check_sampling(self, buffer: ReplayBuffer | None) -> None:
         if buffer is None:
             return
         if self.__dict__["log_prob_from"] is not None:

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.coordinates import quaternion
+from torchrl_sym.mujoco.coordinates import quaternion, rotation
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.links import BALL, FREE, HINGE, SLIDE, Array, links_of, mj, name_of, reference_pose
 
@@ -200,7 +200,7 @@ class Averager:
             if kind == BALL:
                 start = int(model.jnt_qposadr[j])
                 q = data.qpos[start : start + 4] / np.linalg.norm(data.qpos[start : start + 4])
-            turn = turn @ _matrix(q).T
+            turn = turn @ rotation(q).T
             place = anchors[j] - turn @ at
         parent = int(model.body_parentid[body])
         base = data.xpos[parent] + self.moved[int(model.body_weldid[parent])]
@@ -219,7 +219,7 @@ class Averager:
         """Write a pose given in the frame of the body that an element is in."""
         index = element.id
         self._local(element, place, getattr(self.model, f"{kind}_pos")[index], f"{kind} position", name)
-        old = _matrix(getattr(self.model, f"{kind}_quat")[index])
+        old = rotation(getattr(self.model, f"{kind}_quat")[index])
         if self._write(element, "", turn, old, f"{kind} rotation", name, 1.0):
             element.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
             element.quat = quaternion(_frame(element)[1].T @ turn)
@@ -230,7 +230,7 @@ class Averager:
         pos, quat = (getattr(self.model, f"{kind}_{what}")[element.id] for what in ("pos", "quat"))
         element.alt.type = mj.mjtOrientation.mjORIENTATION_QUAT
         element.pos = (turn.T @ (pos - place)).tolist()
-        element.quat = quaternion(turn.T @ _matrix(quat)).tolist()
+        element.quat = quaternion(turn.T @ rotation(quat)).tolist()
 
     def _in_body(self, body: int, place: Array) -> Array:
         """A world position in the frame of a body, where that ends up."""
@@ -281,12 +281,6 @@ def _set_inertial(body: Any, mass: float, place: Array, turn: Array, moments: Ar
     body.fullinertia = [np.nan] * 6
 
 
-def _matrix(q: Array) -> Array:
-    out = np.zeros(9)
-    mj.mju_quat2Mat(out, np.ascontiguousarray(q))
-    return out.reshape(3, 3)
-
-
 def _frame(element: Any) -> tuple[Array, Array]:
     """Position and rotation of the MJCF frames around an element, in its body."""
     place, turn, frame = np.zeros(3), np.eye(3), element.frame
@@ -297,6 +291,6 @@ def _frame(element: Any) -> tuple[Array, Array]:
             resolved = mj.MjSpec.resolve_orientation(
                 degree=frame.compiler.degree, sequence=order, orientation=frame.alt
             )
-        outer = _matrix(np.array(resolved) / np.linalg.norm(resolved))
+        outer = rotation(np.array(resolved) / np.linalg.norm(resolved))
         place, turn, frame = np.array(frame.pos) + outer @ place, outer @ turn, frame.frame
     return place, turn

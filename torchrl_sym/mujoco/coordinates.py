@@ -121,6 +121,13 @@ def quaternion(matrix: Array) -> Array:
     return out / np.linalg.norm(out)
 
 
+def rotation(q: Array) -> Array:
+    """Matrix of a unit quaternion (w, x, y, z)."""
+    out = np.zeros(9)
+    mj.mju_quat2Mat(out, np.ascontiguousarray(q))
+    return out.reshape(3, 3)
+
+
 def conjugate(q: Array) -> Array:
     """Inverse of a unit quaternion."""
     return q * np.array([1.0, -1.0, -1.0, -1.0])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from torchrl_sym.mujoco.coordinates import CoordinateMap
+from torchrl_sym.mujoco.coordinates import CoordinateMap, rotation
 from torchrl_sym.mujoco.elements import Image, map_sites
 from torchrl_sym.mujoco.links import (
     Array,
@@ -332,10 +332,8 @@ def _ends(model: MjModel, data: MjData, e: int) -> tuple[list[int], Array, Array
     owners = [int(model.body_weldid[body]) for body in bodies]
     if kind != _WELD:
         return owners, points, np.eye(3)
-    relative = np.eye(3).ravel()
-    if not by_site:
-        mj.mju_quat2Mat(relative, prm[6:10])
-    return owners, points, frames[0] @ relative.reshape(3, 3) @ frames[1].T
+    relative = np.eye(3) if by_site else rotation(prm[6:10])
+    return owners, points, frames[0] @ relative @ frames[1].T
 
 
 def column_scale(values: Array) -> Array:

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
 from torchrl_sym.mujoco.subjects import Observation, Outcome, Subject, subject_of, write_state
+from torchrl_sym.specs import image_of_box
 from torchrl_sym.symmetry import Symmetry
 
 # In the order of cause: a wrong part makes those after it wrong as well. States come before observations,
@@ -307,16 +308,11 @@ class _Check:
         self.note(part, self.group.names[g], residual[worst], limit, self.labels[worst])
 
     def action_box(self) -> None:
-        low, high = (x.numpy() for x in (self.subject.low, self.subject.high))
+        box = self.subject.low, self.subject.high
+        images = image_of_box(self.subject.symmetry["action"].matrices.cpu(), *box)
         for g, element in enumerate(self.group.names):
-            matrix = self.subject.symmetry["action"].matrices[g].double().cpu().numpy()
-            with np.errstate(invalid="ignore"):
-                ends = [np.where(matrix == 0, 0.0, matrix * bound) for bound in (low, high)]
-                image = np.minimum(*ends).sum(axis=1), np.maximum(*ends).sum(axis=1)
-                gaps = [
-                    np.where(a == b, 0.0, np.abs(a - b)) for a, b in zip(image, (low, high), strict=True)
-                ]
-            gap = np.maximum(*gaps)
+            pairs = zip(images, box, strict=True)
+            gap = np.maximum(*(torch.where(a[g] == b, 0.0, (a[g] - b).abs()).numpy() for a, b in pairs))
             limit = max(self.tolerance, 1e-6)  # bounds are single precision in most specs
             self.note("action box", element, gap.max(initial=0.0), limit, _entries("action", gap, limit))
 
