@@ -1,5 +1,6 @@
 """derive: published tables, independence of how a model is written, and equivariance of the simulator."""
 
+import copy
 import time
 from dataclasses import replace
 
@@ -157,6 +158,32 @@ def test_one_flipped_sign_or_two_swapped_legs_are_noticed():
     robot.qvel.blocks[0].sign[1, 6] *= -1
     index[1, [6, 9]] = index[1, [9, 6]]
     assert step_residual(compiled, robot, 1, 0)[0] > 1e-2
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_one_element_per_row_maps_rows_as_it_does_one_by_one(name):
+    compiled, group = ROBOTS[name]
+    compiled = copy.deepcopy(compiled)
+    compiled.qpos0[-9:] += 0.1 * np.arange(9)  # offsets: the pose that the group keeps is not at zero
+    robot = derive(compiled, group, tolerance=2.0)
+    assert any(robot.offsets(g) for g in group.names)
+    generator = torch.Generator().manual_seed(0)
+    g = torch.randint(group.order, (12, 5), generator=generator)
+    maps = {"qpos": compiled.nq, "qvel": compiled.nv, "ctrl": compiled.nu, "act": compiled.na}
+    for kind, size in maps.items():
+        image = getattr(robot, f"map_{kind}")
+        for dtype in (torch.float64, torch.float32):
+            x = torch.randn(12, 5, size, generator=generator, dtype=dtype)
+            expected = torch.stack([image(x, e) for e in range(group.order)])
+            one_by_one = expected.gather(0, g[None, ..., None].expand(1, *x.shape))[0]
+            torch.testing.assert_close(image(x, g), one_by_one)  # dense blocks round differently
+            torch.testing.assert_close(image(x, g[:, 0])[:, 3], image(x[:, 3], g[:, 0]))
+            assert torch.equal(image(x, group.names[-1]), expected[-1])
+            assert image(x, g).dtype == dtype
+    with pytest.raises(ValueError, match="expected indices of elements"):
+        robot.map_qpos(torch.zeros(3, compiled.nq), g)
+    with pytest.raises(KeyError, match="expected element indices"):
+        robot.map_ctrl(torch.zeros(2, compiled.nu), torch.tensor([0, group.order]))
 
 
 def test_ball_joints_and_slides_commute_in_random_frames():

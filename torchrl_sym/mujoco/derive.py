@@ -27,7 +27,7 @@ from torchrl_sym.mujoco.elements import (
 from torchrl_sym.mujoco.links import Array, Matcher, MjModel, links_of, name_of, reference_pose
 from torchrl_sym.mujoco.sensors import SensorMap, SensorMapper, sensor_matrices
 from torchrl_sym.representations import Representation
-from torchrl_sym.representations.blocks import SignedPermutation
+from torchrl_sym.representations.blocks import SignedPermutation, block_from_matrices
 
 Kind = Literal["joint", "actuator", "body", "site", "tendon", "sensor"]
 
@@ -143,6 +143,29 @@ def _scatter(images: dict[int, Image], size: int) -> tuple[Array, Array]:
     return matrix, offset
 
 
+class _Affine:
+    """x -> rho(g) x + c(g): coordinates whose zero the group does not keep."""
+
+    def __init__(self, linear: Representation, offsets: list[Array]) -> None:
+        self.linear = linear
+        self.offset = torch.as_tensor(np.stack(offsets))  # (N, d)
+        self.moves = bool(self.offset.any())
+        self.casts: dict[tuple[torch.dtype, torch.device], Tensor] = {}
+
+    def __call__(self, x: Tensor, g: int | str | Tensor) -> Tensor:
+        image = self.linear(x, g)
+        if not self.moves:
+            return image
+        kind = (image.dtype, image.device)
+        if kind not in self.casts:
+            self.casts[kind] = self.offset.to(image)
+        offset = self.casts[kind]
+        if not isinstance(g, Tensor):
+            return image + offset[self.linear.group.index(g)]
+        rows = offset.index_select(0, g.flatten())
+        return image + rows.view(*g.shape, *[1] * (x.ndim - 1 - g.ndim), -1)
+
+
 class ModelSymmetry:
     """What :func:`derive` found: named tables, representations and full-state maps.
 
@@ -165,7 +188,9 @@ class ModelSymmetry:
         self.joint_velocities = self.joint_positions
         self.actuators = self._represent([action.ctrl for action in actions])
         self.qvel = self._represent([action.coordinates.qvel for action in actions])
-        self._qpos = self._represent([action.coordinates.qpos for action in actions])
+        positions = self._represent([action.coordinates.qpos for action in actions])
+        self._map_qpos = _Affine(positions, [action.coordinates.qpos_offset for action in actions])
+        self._map_ctrl = _Affine(self.actuators, [action.ctrl_offset for action in actions])
         self._act = self._represent([action.act for action in actions])
         self._mocap_position = self._represent([a.coordinates.mocap_position for a in actions])
         self._mocap_rotation = self._represent([a.coordinates.mocap_rotation for a in actions])
@@ -174,7 +199,15 @@ class ModelSymmetry:
         if matrices[0].shape[0] == 0:
             empty = torch.zeros(self.group.order, 0)
             return Representation.from_blocks(self.group, [SignedPermutation(empty, empty)], check=False)
-        return Representation(self.group, torch.as_tensor(np.stack(matrices)))
+        whole = np.stack(matrices)
+        used = (whole != 0).any(axis=0)
+        used |= used.T
+        # cut wherever no entry reaches across, so that joints beside a turned cube are still permuted
+        furthest = [max(i, int(np.flatnonzero(row).max(initial=0))) for i, row in enumerate(used)]
+        ends = [i + 1 for i, last in enumerate(np.maximum.accumulate(furthest)) if last == i]
+        parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
+        blocks = [block_from_matrices(torch.as_tensor(whole[:, part, part])) for part in parts]
+        return Representation.from_blocks(self.group, blocks)
 
     def _joint_representation(self, joints: list[int]) -> Representation:
         place = {j: i for i, j in enumerate(joints)}
@@ -273,26 +306,41 @@ class ModelSymmetry:
             if abs(offset) > 1e-12
         }
 
-    def map_qpos(self, qpos: Tensor, g: int | str) -> Tensor:
-        """Image of positions ``(..., nq)``."""
-        g = self.group.index(g)
-        offset = torch.as_tensor(self._actions[g].coordinates.qpos_offset).to(qpos)
-        return self._qpos(qpos, g) + offset
+    def map_qpos(self, qpos: Tensor, g: int | str | Tensor) -> Tensor:
+        """Image of positions under one element, or under one per row.
 
-    def map_qvel(self, qvel: Tensor, g: int | str) -> Tensor:
-        """Image of velocities (or of ``qacc_warmstart``) ``(..., nv)``."""
+        Args:
+            qpos: ``(..., nq)``, in the units of the model.
+            g: an element by index or name, or integer indices of the leading dimensions' shape.
+
+        Raises:
+            KeyError: no such element.
+            ValueError: a last dimension other than nq, or indices of another shape.
+
+        Example:
+            >>> import mujoco
+            >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody>
+            ...   <body><joint type="slide" axis="0 1 0"/><geom size=".1"/></body>
+            ... </worldbody></mujoco>''')
+            >>> robot = derive(model, PointGroup.reflection("y"))
+            >>> robot.map_qpos(torch.tensor([[1.0], [2.0]]), torch.tensor([0, 1])).tolist()
+            [[1.0], [-2.0]]
+        """
+        return self._map_qpos(qpos, g)
+
+    def map_qvel(self, qvel: Tensor, g: int | str | Tensor) -> Tensor:
+        """Image of velocities (or of ``qacc_warmstart``) ``(..., nv)``; ``g`` as in :meth:`map_qpos`."""
         return self.qvel(qvel, g)
 
-    def map_ctrl(self, ctrl: Tensor, g: int | str) -> Tensor:
+    def map_ctrl(self, ctrl: Tensor, g: int | str | Tensor) -> Tensor:
         """Image of controls ``(..., nu)``, in the units of the actuators."""
-        g = self.group.index(g)
-        return self.actuators(ctrl, g) + torch.as_tensor(self._actions[g].ctrl_offset).to(ctrl)
+        return self._map_ctrl(ctrl, g)
 
-    def map_act(self, act: Tensor, g: int | str) -> Tensor:
+    def map_act(self, act: Tensor, g: int | str | Tensor) -> Tensor:
         """Image of actuator states ``(..., na)``."""
         return self._act(act, g)
 
-    def map_mocap(self, position: Tensor, rotation: Tensor, g: int | str) -> tuple[Tensor, Tensor]:
+    def map_mocap(self, position: Tensor, rotation: Tensor, g: int | str | Tensor) -> tuple[Tensor, Tensor]:
         """Image of mocap poses ``(..., nmocap, 3)`` and ``(..., nmocap, 4)``."""
         images = (
             representation(x.flatten(-2), g).unflatten(-1, x.shape[-2:])
