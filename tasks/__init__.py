@@ -6,8 +6,9 @@ the names.
 
 from typing import TYPE_CHECKING, Any
 
+from tasks import anymal_push as anymal_push  # importing a task's file registers the task
 from tasks import base
-from tasks import cartpole as cartpole  # importing a task's file registers the task
+from tasks import cartpole as cartpole
 from tasks.environment import make_env
 
 if TYPE_CHECKING:

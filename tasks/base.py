@@ -17,6 +17,8 @@ import difflib
 import importlib.resources
 import inspect
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import mujoco
@@ -25,11 +27,36 @@ from torch import Tensor
 
 from tasks.simulation import Simulation
 from tasks.state import Element, State
-from torchrl_sym import Symmetry
+from torchrl_sym import PointGroup, Representation, Symmetry
+from torchrl_sym.mujoco import derive
+
+mj: Any = mujoco  # its compiled modules have no type stubs
+Edit = Callable[[Any], None]
 
 _TASKS: dict[str, type[Task]] = {}
 
 T = TypeVar("T", bound="type[Task]")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A block of the observation: the layout of a task is a tuple of these, in order.
+
+    Attributes:
+        name: what it is.
+        representation: how the group acts on it; its ``dim`` is the block's size.
+        unit: of the physical quantity.
+        frame: in which frame it is measured.
+        kind: how it transforms, in words.
+        scale: what the quantity is multiplied by.
+    """
+
+    name: str
+    representation: Representation
+    unit: str
+    frame: str
+    kind: str
+    scale: float = 1.0
 
 
 class Task(abc.ABC):
@@ -37,17 +64,26 @@ class Task(abc.ABC):
 
     Class attributes a task sets: ``name``; ``asset`` (its file in tasks/assets);
     ``control_timestep`` [s]; ``episode_seconds`` [s]; ``observation_size``; ``action_size``;
-    ``goal_names``, one per group element in the group's order; and if 1000 is not right,
-    ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged. A constructor sets
-    ``symmetry``.
+    ``goal_names``, one per group element in the group's order; ``carried``, names of objects whose
+    orientation the group only carries along (:func:`~torchrl_sym.mujoco.derive`); and if 1000 is not
+    right, ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged.
 
     The group acts on three things that must agree: observations and actions (``symmetry``) and the
     full state (:meth:`transform_state`). Then for every element g, with L_g and K_g of the paper::
 
         T(L_g s, K_g a) = L_g T(s, a),  r(L_g s, K_g a) = r(s, a),  observe(L_g s) = L_g observe(s)
 
+    All of it is derived from the model: a task states its :meth:`layout` in terms of ``robot``.
+
     Args:
+        group: the group that acts, about the vertical axis through the world's origin.
         episode_seconds: length of an episode, s; None for the task's own.
+        edit: changes the model's specification (``MjSpec``) before it is compiled.
+
+    Attributes:
+        model: the compiled model.
+        robot: the symmetry derived from it.
+        symmetry: how the group acts on observation and action.
 
     Example:
         >>> from tasks.base import create
@@ -63,11 +99,12 @@ class Task(abc.ABC):
     observation_size: ClassVar[int]
     action_size: ClassVar[int]
     goal_names: ClassVar[tuple[str, ...]]
+    carried: ClassVar[tuple[str, ...]] = ()
     max_velocity: float = 1000.0
 
-    symmetry: Symmetry
-
-    def __init__(self, *, episode_seconds: float | None = None) -> None:
+    def __init__(
+        self, group: PointGroup, *, episode_seconds: float | None = None, edit: Edit | None = None
+    ) -> None:
         if episode_seconds is not None:
             self.episode_seconds = float(episode_seconds)
         if not self.episode_seconds >= self.control_timestep:
@@ -75,12 +112,26 @@ class Task(abc.ABC):
                 "expected episode_seconds of at least one control step "
                 f"({self.control_timestep} s), got {self.episode_seconds}"
             )
-        self.model = load_model(self.asset)
+        self.model = load_model(self.asset, edit)
         if not math.isclose(self.substeps * self.model.opt.timestep, self.control_timestep):
             raise ValueError(
                 f"expected a control_timestep that is a multiple of the model's timestep "
                 f"{self.model.opt.timestep} s, got {self.control_timestep} s; change one of the two"
             )
+        self.robot = derive(self.model, group, **({"carried": self.carried} if self.carried else {}))
+        parts = [entry.representation for entry in self.layout()]
+        self.symmetry = Symmetry(
+            group, {"observation": sum(parts[1:], parts[0]), "action": self.robot.actuators}
+        )
+        self._variables = self.variables()
+
+    @abc.abstractmethod
+    def layout(self) -> tuple[Entry, ...]:
+        """The blocks of the observation, in order."""
+
+    def variables(self) -> dict[str, Representation]:
+        """How the group acts on each of the task's own variables, ``(n, dim)``; none by default."""
+        return {}
 
     @property
     def substeps(self) -> int:
@@ -154,14 +205,41 @@ class Task(abc.ABC):
         """Whether the episode ends here with no future value, ``(n,)`` bool; None: in no row."""
         return None
 
-    @abc.abstractmethod
+    def success(self, state: State) -> Tensor | None:
+        """Whether an episode that ends in ``state`` reached its goal, ``(n,)`` bool; None: no such notion."""
+        return None
+
     def transform_state(self, state: State, g: Element) -> State:
         """L_g on the full state, task variables included; a new state.
 
         Args:
             state: n rows.
             g: an element by index or name, or one index per row, ``(n,)``.
+
+        Raises:
+            KeyError: a variable that :meth:`variables` does not declare.
         """
+        unknown = [name for name in state.variables if name not in self._variables]
+        if unknown:
+            raise KeyError(
+                f"expected every task variable in variables(), which declares {list(self._variables)}, got "
+                f"{unknown}; say how they transform"
+            )
+        position, rotation = state.mocap_pos, state.mocap_quat
+        if position is not None and rotation is not None and self.model.nmocap:
+            position, rotation = self.robot.map_mocap(position, rotation, g)
+        return State(
+            qpos=self.robot.map_qpos(state.qpos, g),
+            qvel=self.robot.map_qvel(state.qvel, g),
+            mocap_pos=position,
+            mocap_quat=rotation,
+            time=state.time.clone(),
+            variables={name: self._variables[name](x, g) for name, x in state.variables.items()},
+        )
+
+    def metrics(self) -> dict[str, float]:
+        """How training goes (success rate, curriculum level), always the same names; empty by default."""
+        return {}
 
     def state_dict(self) -> dict[str, Any]:
         """What the task learned itself during training (a curriculum phase); empty by default."""
@@ -171,11 +249,12 @@ class Task(abc.ABC):
         """Continue from :meth:`state_dict`."""
 
 
-def load_model(asset: str) -> mujoco.MjModel:  # pyright: ignore[reportAttributeAccessIssue]
+def load_model(asset: str, edit: Edit | None = None) -> Any:
     """Compile an MJCF file of tasks/assets; its includes are found there too.
 
     Args:
         asset: file name, such as ``"cartpole.xml"``.
+        edit: changes the ``MjSpec`` before it is compiled.
 
     Example:
         >>> load_model("cartpole.xml").nu
@@ -188,8 +267,10 @@ def load_model(asset: str) -> mujoco.MjModel:  # pyright: ignore[reportAttribute
             f"expected {asset!r} among the files of tasks/assets, got {sorted(files)}; "
             "a missing file there means that the package was installed without its data"
         )
-    text = files.pop(asset).decode()
-    return mujoco.MjModel.from_xml_string(text, files)  # pyright: ignore[reportAttributeAccessIssue]
+    spec = mj.MjSpec.from_string(files.pop(asset).decode(), include=files)
+    if edit is not None:
+        edit(spec)
+    return spec.compile()
 
 
 def register(cls: T) -> T:
@@ -231,10 +312,23 @@ def create(name: str, **task_kwargs: Any) -> Task:
         close = difflib.get_close_matches(str(name), _TASKS, n=1)
         hint = f"; did you mean {close[0]!r}?" if close else "; see tasks.ALL_TASKS"
         raise KeyError(f"expected one of the tasks {list(_TASKS)}, got {name!r}{hint}")
-    accepted = list(inspect.signature(_TASKS[name]).parameters)
+    accepted = _arguments(_TASKS[name])
     unknown = [key for key in task_kwargs if key not in accepted]
     if unknown:
         raise TypeError(
             f"expected task arguments of {name!r} among {accepted}, got {unknown}; remove or rename them"
         )
     return _TASKS[name](**task_kwargs)
+
+
+def _arguments(cls: type) -> list[str]:
+    """Keyword arguments of a constructor, with those it hands on to its base class by ``**``."""
+    names: list[str] = []
+    for ancestor in cls.__mro__:
+        if "__init__" not in vars(ancestor):
+            continue
+        parameters = inspect.signature(ancestor).parameters.values()
+        names += [p.name for p in parameters if p.kind is not p.VAR_KEYWORD]
+        if all(p.kind is not p.VAR_KEYWORD for p in parameters):
+            break
+    return names

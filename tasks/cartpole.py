@@ -19,10 +19,9 @@ import math
 import torch
 from torch import Tensor
 
-from tasks.base import Task, register
-from tasks.state import Element, State
-from torchrl_sym import PointGroup, Symmetry
-from torchrl_sym.representations import pseudoscalar
+from tasks.base import Entry, Task, register
+from tasks.state import State
+from torchrl_sym import PointGroup
 
 # Desired cart velocity at full action, m/s. The paper gives no limit.
 MAX_CART_VELOCITY = 3.0
@@ -65,14 +64,18 @@ class CartPole(Task):
     goal_names = ("right", "left")
 
     def __init__(self, *, episode_seconds: float | None = None) -> None:
-        super().__init__(episode_seconds=episode_seconds)
-        group = PointGroup.reflection("x")
-        # Sliding along x and turning about y: one sign for both coordinates and all made of them.
-        self._coordinates = pseudoscalar(group) * 2
-        self.symmetry = Symmetry(
-            group, {"observation": pseudoscalar(group) * 3, "action": pseudoscalar(group)}
-        )
+        super().__init__(PointGroup.reflection("x"), episode_seconds=episode_seconds)
         self._velocity_scale = torch.tensor(VELOCITY_SCALE, dtype=torch.float64)
+
+    def layout(self) -> tuple[Entry, ...]:
+        """Cart velocity, pole angle, pole velocity."""
+        cart, pole = (self.robot.joints([name]) for name in ("slide", "hinge"))
+        joint = "sign of its joint"
+        return (
+            Entry("cart velocity", cart, "m/s", "world", joint, 1 / VELOCITY_SCALE[0]),
+            Entry("pole angle from upright", pole, "rad", "world", joint, 1 / ANGLE_SCALE),
+            Entry("pole velocity", pole, "rad/s", "world", joint, 1 / VELOCITY_SCALE[1]),
+        )
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The pole lies flat to the right; noise on its angle and on both velocities."""
@@ -99,11 +102,6 @@ class CartPole(Task):
     def reward(self, state: State, action: Tensor) -> Tensor:
         """Minus the pole's distance from upright, over the time of the step, rad s."""
         return _angle(state).abs().mul_(-self.control_timestep)
-
-    def transform_state(self, state: State, g: Element) -> State:
-        """Mirror cart and pole."""
-        flip = self._coordinates
-        return State(flip(state.qpos, g), flip(state.qvel, g), time=state.time.clone())
 
 
 def _angle(state: State) -> Tensor:

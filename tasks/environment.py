@@ -256,6 +256,10 @@ class BatchedEnv(EnvBase):
             truncated=flags[2],
         )
 
+    def metrics(self) -> dict[str, float]:
+        """Simulations that diverged so far, and what the task measures of training (success, level)."""
+        return {"diverged": float(self.num_diverged), **self.task.metrics()}
+
     def save_state(self) -> dict[str, Any]:
         """Everything that decides the future of this environment, as copied tensors.
 

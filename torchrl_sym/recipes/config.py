@@ -75,6 +75,10 @@ class PPOConfig:
     last_layer_scale: float = 1.0
     """Further factor on the actor's last layer; 0.1 is usual for legged robots."""
 
+    output_scale: float = 1.0
+    """Factor on the network's output: the size, in units of the action, of an ordinary action. Legged
+    robots have a wide action box and work in a quarter of it."""
+
     max_log_ratio: float = 20.0
     """Bound of log pi / pi_k for naive augmentation, which overflows without."""
     checkpoint_interval: int = 1
@@ -93,8 +97,16 @@ class PPOConfig:
                 raise ValueError(f"{name}: expected a whole number of at least 1, got {value}")
         if not all(size >= 1 for size in self.hidden):
             raise ValueError(f"hidden: expected positive sizes, got {self.hidden}")
-        positive = ("learning_rate", "max_grad_norm", "initial_std", "min_std", "max_std", "clip_epsilon")
-        for name in positive:
+        positive = (
+            "learning_rate",
+            "max_grad_norm",
+            "initial_std",
+            "min_std",
+            "max_std",
+            "clip_epsilon",
+            "output_scale",
+        )
+        for name in (*positive, "output_scale"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("gamma", "lmbda"):

@@ -16,10 +16,18 @@ from torchrl_sym.representations import Representation
 
 
 class FeedForward(nn.Module):
-    """ELU network on its concatenated inputs, which are cast to its own precision."""
+    """ELU network on its concatenated inputs, which are cast to its own precision.
 
-    def __init__(self, in_size: int, out_size: int, hidden: Sequence[int]) -> None:
+    Args:
+        in_size: number of inputs.
+        out_size: number of outputs.
+        hidden: sizes of the hidden layers.
+        scale: factor on the outputs.
+    """
+
+    def __init__(self, in_size: int, out_size: int, hidden: Sequence[int], scale: float = 1.0) -> None:
         super().__init__()
+        self.scale = scale
         self.net = MLP(in_size, out_size, num_cells=list(hidden), activation_class=nn.ELU)
 
     @property
@@ -29,7 +37,8 @@ class FeedForward(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1)
-        return self.net(x.to(next(self.net.parameters()).dtype))
+        out = self.net(x.to(next(self.net.parameters()).dtype))
+        return out if self.scale == 1.0 else out * self.scale
 
 
 class Gaussian(nn.Module):
@@ -81,7 +90,7 @@ def make_actor(
         out_size: number of actions.
         action: representation of the action, needed for ``config.tie_std``.
     """
-    net = FeedForward(in_size, out_size, config.hidden)
+    net = FeedForward(in_size, out_size, config.hidden, config.output_scale)
     with torch.no_grad():
         for layer in net.linear:
             scale = config.weight_scale * (config.last_layer_scale if layer is net.linear[-1] else 1.0)

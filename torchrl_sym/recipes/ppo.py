@@ -30,7 +30,7 @@ from torchrl_sym.mirror_loss import MirrorLoss
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_actor, make_critic
-from torchrl_sym.recipes.resume import resume, snapshot
+from torchrl_sym.recipes.resume import call_env, resume, snapshot
 from torchrl_sym.recipes.storage import RunFolder, make_logger
 from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
 from torchrl_sym.symmetry import Symmetry
@@ -72,7 +72,8 @@ def train(
     Yields:
         iteration, frames, return (mean of the latest finished episodes), mirror_loss, log_prob and
         log_prob_copies (mean log pi_k of samples and of their copies), kl, every loss and diagnostic of
-        the updates, learning_rate, std, seconds, frames_per_second.
+        the updates, learning_rate, std, seconds, frames_per_second; and what the environment's own
+        ``metrics()`` returns, if it has any (success rate, level of the curriculum).
 
     Raises:
         ValueError: the folder holds a run with another configuration.
@@ -129,6 +130,7 @@ def train(
         for iteration, data in enumerate(collector, start + 1):
             metrics = {"iteration": iteration, "frames": iteration * data.numel()}
             metrics["return"] = episodes.update(data)
+            metrics |= call_env(env, "metrics") or {}
             metrics |= symmetry_metrics(actor, symmetry, data)
             if naive is not None:
                 data = naive(data)  # before GAE: also the advantage is that of the copies

@@ -31,7 +31,7 @@ def snapshot(
         "episodes": episodes.state_dict(),
         "rng": torch.get_rng_state(),
         "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "env": _call(env, "save_state"),
+        "env": call_env(env, "save_state"),
         "transforms": env.transform.state_dict() if isinstance(env, TransformedEnv) else None,
     }
 
@@ -44,7 +44,7 @@ def resume(
     if run is None or checkpoint is None:
         if run is not None:
             run.truncate(0)  # a row that was logged before the first checkpoint
-        _call(env, "stagger")
+        call_env(env, "stagger")
         return 0, 0.0
     differences = config.differences(checkpoint["config"])
     if differences:
@@ -67,7 +67,7 @@ def _restore_env(env: EnvBase, checkpoint: dict[str, Any], *, finished: bool) ->
     if isinstance(env, TransformedEnv):
         env.transform.load_state_dict(checkpoint["transforms"])
     if checkpoint["env"] is not None:
-        _call(env, "restore_state", checkpoint["env"])
+        call_env(env, "restore_state", checkpoint["env"])
     if not finished and (checkpoint["env"] is None or isinstance(env, TransformedEnv)):
         warnings.warn(
             "the run continues with the networks and optimizer it had, but not exactly: the environment "
@@ -76,7 +76,7 @@ def _restore_env(env: EnvBase, checkpoint: dict[str, Any], *, finished: bool) ->
         )
 
 
-def _call(env: EnvBase, method: str, *arguments: Any) -> Any:
+def call_env(env: EnvBase, method: str, *arguments: Any) -> Any:
     """Call an optional method of the environment inside all transforms, if its class has it.
 
     The class is asked, not the object: environments of processes look attributes up in their workers.

@@ -1,0 +1,275 @@
+"""What the tasks of the quadruped ANYmal share: its observation, control, gait and regularisation.
+
+The robot is observed in its own base frame, so that only the part of a symmetry that relabels its body is
+seen by the policy. Quantities of the base come from the floating joint, feet from closed-form kinematics;
+nothing is read from derived fields of the simulator, which lag by one physics step.
+
+No term of a reward prefers a direction, a leg or a sign: all are norms, or even functions of the state.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tasks.base import Edit, Entry, Task
+from tasks.state import State
+from torchrl_sym import PointGroup, Representation
+from torchrl_sym.representations import axial, invariant, polar
+
+LEGS = ("LF", "RF", "LH", "RH")
+JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("HAA", "HFE", "KFE"))
+# Standing pose, rad (legged_gym), and what an action of 1 adds to it. The reach is wide because a position
+# servo exerts force only by a target beyond the leg's present position.
+DEFAULT_POSE = (0.0, 0.4, -0.8, 0.0, 0.4, -0.8, 0.0, -0.4, 0.8, 0.0, -0.4, 0.8)
+ACTION_RANGE = 2.0
+# What observations are multiplied by (legged_gym); the last action is seen in steps of 0.5 rad.
+LINEAR_SCALE, ANGULAR_SCALE, JOINT_VELOCITY_SCALE, ACTION_SCALE = 2.0, 0.25, 0.05, 4.0
+# Observations beyond it are cut off: a robot that tumbles must not blow up the networks.
+OBSERVATION_LIMIT = 20.0
+FOOT_RADIUS = 0.03
+# A foot this close to the ground counts as standing on it, m.
+TOUCH_DISTANCE = 0.01
+# Kinematics of a leg, m: hip and thigh origins, knee below thigh, foot below knee (assets/README.md).
+_HIP, _THIGH, _KNEE, _FOOT = (
+    (0.2999, 0.104),
+    (0.0599, 0.08381),
+    (0.1003, -0.285),
+    (0.08795, 0.01305, -0.31547),
+)
+_SIDE_X, _SIDE_Y = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)
+
+
+class Anymal(Task):
+    """Base of the tasks with ANYmal: 12 joint targets in, 45 proprioceptive numbers out.
+
+    Action: joint position targets relative to the standing pose, over 2 rad, clipped to [-1, 1].
+
+    Args:
+        episode_seconds: length of an episode, s; None for the task's own.
+        physics_timestep: 0.005 s; 0.01 s simulates 1.65 times as fast and was good enough to train in.
+        friction: range of the sliding friction of the ground, drawn per episode; None keeps the model's.
+        added_mass: range of the mass added to the base, kg, drawn per episode; None adds none.
+        payload: mass in kg fixed on top of the base at ``payload_position``, for studies of asymmetry.
+        payload_position: where, in the base frame, m. Off the centre, the robot is no longer symmetric.
+        weak_leg: name of a leg (``"LF"``, ...) whose drives have half their strength, for such studies.
+
+    Raises:
+        ValueError: no such leg, or a range that is not positive.
+    """
+
+    control_timestep = 0.02
+    action_size = 12
+    max_velocity = 100.0
+
+    def __init__(
+        self,
+        *,
+        episode_seconds: float | None = None,
+        physics_timestep: float = 0.005,
+        friction: tuple[float, float] | None = None,
+        added_mass: tuple[float, float] | None = None,
+        payload: float = 0.0,
+        payload_position: tuple[float, float, float] = (0.0, 0.0, 0.1),
+        weak_leg: str | None = None,
+    ) -> None:
+        if weak_leg is not None and weak_leg not in LEGS:
+            raise ValueError(f"weak_leg: expected one of {list(LEGS)}, got {weak_leg!r}")
+        if payload < 0 or (friction is not None and not 0 < friction[0] <= friction[1]):
+            raise ValueError(
+                f"expected a payload >= 0 kg and a rising, positive range of friction, got {payload} and "
+                f"{friction}"
+            )
+        edit = _edit(physics_timestep, payload, payload_position, weak_leg)
+        super().__init__(PointGroup.klein_four(), episode_seconds=episode_seconds, edit=edit)
+        self.friction, self.added_mass = friction, added_mass
+        self._pose = torch.tensor(DEFAULT_POSE, dtype=torch.float64)
+        self._side_x = torch.tensor(_SIDE_X, dtype=torch.float64)
+        self._side_y = torch.tensor(_SIDE_Y, dtype=torch.float64)
+
+    def proprioception(self) -> tuple[Entry, ...]:
+        """The first 45 numbers of every observation."""
+        group, robot = self.robot.group, self.robot
+        joints = robot.joints(JOINTS)
+        by_joint = "permutation and signs of the joints"
+        return (
+            Entry("linear velocity", polar(group), "m/s", "base", "polar vector", LINEAR_SCALE),
+            Entry("angular velocity", axial(group), "rad/s", "base", "axial vector", ANGULAR_SCALE),
+            Entry("direction of gravity", polar(group), "1", "base", "polar vector"),
+            Entry("joint positions from the standing pose", joints, "rad", "joints", by_joint),
+            Entry("joint velocities", joints, "rad/s", "joints", by_joint, JOINT_VELOCITY_SCALE),
+            Entry("last action", robot.actuators, "2 rad", "joints", by_joint, ACTION_SCALE),
+        )
+
+    def variables(self) -> dict[str, Representation]:
+        """Last action, joint velocities one step ago, time in the air of every foot, curriculum level."""
+        group = self.robot.group
+        knees = self.robot.joints([f"{leg}_KFE" for leg in LEGS]).absolute()
+        return {
+            "last_action": self.robot.actuators,
+            "last_velocity": self.robot.joints(JOINTS),
+            "air_time": knees,
+            "level": invariant(group, 1),
+        }
+
+    def standing(self, n: int, yaw: Tensor, generator: torch.Generator | None) -> State:
+        """Robots in about the standing pose at the origin, their lowest foot 5 mm above the ground.
+
+        Args:
+            n: how many.
+            yaw: heading, ``(n,)``, rad.
+            generator: source of the noise on the joints.
+        """
+        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
+        noise = torch.rand(n, 12, generator=generator, dtype=torch.float64) * 0.2 - 0.1
+        qpos[:, 7:19] = self._pose + noise
+        qpos[:, 3], qpos[:, 6] = (yaw / 2).cos(), (yaw / 2).sin()
+        qpos[:, 2] = FOOT_RADIUS + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
+        zeros = torch.zeros(n, 12, dtype=torch.float64)
+        return State(
+            qpos=qpos,
+            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
+            mocap_pos=torch.zeros(n, self.model.nmocap, 3, dtype=torch.float64),
+            mocap_quat=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, self.model.nmocap, 1),
+            variables={
+                "last_action": zeros,
+                "last_velocity": zeros.clone(),
+                "air_time": zeros[:, :4].clone(),
+                "level": zeros[:, :1].clone(),
+            },
+        )
+
+    def control(self, action: Tensor, state: State) -> Tensor:
+        """Joint position targets, rad."""
+        return action.double().clamp(-1.0, 1.0) * ACTION_RANGE + self._pose
+
+    def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Remember the action, the joint velocities, and how long each foot has been in the air."""
+        air = (state.variables["air_time"] + self.control_timestep) * ~self.touching(state)
+        return {
+            "last_action": action.double().clamp(-1.0, 1.0),
+            "last_velocity": state.qvel[:, 6:18],
+            "air_time": air,
+        }
+
+    def observe_robot(self, state: State, observation: Tensor) -> None:
+        """Write the 45 proprioceptive numbers into the first columns of ``(n, 45 or more)``."""
+        turn = rotation(state)
+        parts = (
+            into_base(turn, state.qvel[:, 0:3]) * LINEAR_SCALE,
+            state.qvel[:, 3:6] * ANGULAR_SCALE,
+            -turn[:, 2],
+            state.qpos[:, 7:19] - self._pose,
+            state.qvel[:, 6:18] * JOINT_VELOCITY_SCALE,
+            state.variables["last_action"] * ACTION_SCALE,
+        )
+        torch.cat([part.float() for part in parts], dim=1, out=observation[:, :45])
+
+    def feet_in_base(self, joints: Tensor) -> Tensor:
+        """Centres of the feet in the base frame, ``(n, 12)`` joint angles to ``(n, 4, 3)``, m."""
+        q1, q2, q3 = joints.unflatten(-1, (4, 3)).unbind(-1)
+        q23 = q2 + q3
+        fx, fz = _FOOT[0] * self._side_x, _FOOT[2]
+        sin, cos = q23.sin(), q23.cos()
+        x = _KNEE[1] * q2.sin() + fx * cos + fz * sin + _THIGH[0] * self._side_x
+        z = _KNEE[1] * q2.cos() - fx * sin + fz * cos
+        y = (_THIGH[1] + _KNEE[0] + _FOOT[1]) * self._side_y
+        sin, cos = q1.sin(), q1.cos()
+        foot = (x + _HIP[0] * self._side_x, y * cos - z * sin + _HIP[1] * self._side_y, y * sin + z * cos)
+        return torch.stack(foot, dim=-1)
+
+    def feet(self, state: State) -> Tensor:
+        """Centres of the feet in the world frame, ``(n, 4, 3)``, m."""
+
+        def compute() -> Tensor:
+            return self.feet_in_base(state.qpos[:, 7:19]) @ rotation(state).mT + state.qpos[:, None, 0:3]
+
+        return state.shared("feet", compute)
+
+    def ground(self, state: State, points: Tensor) -> Tensor:
+        """Height of the ground at points ``(n, p, 2 or more)`` of the world frame, ``(n, p)``, m."""
+        return torch.zeros(points.shape[:2], dtype=points.dtype)
+
+    def touching(self, state: State) -> Tensor:
+        """Whether each foot stands on something, ``(n, 4)``."""
+
+        def compute() -> Tensor:
+            feet = self.feet(state)
+            return feet[..., 2] - self.ground(state, feet) < FOOT_RADIUS + TOUCH_DISTANCE
+
+        return state.shared("touching", compute)
+
+    def first_touch(self, state: State, longest: float = 0.4, shortest: float = 0.1) -> Tensor:
+        """Air time of the feet that touch down in this step, ``(n,)``, s: a reward for taking steps.
+
+        Capped, and never negative: a penalty for short steps makes contact chatter so expensive that
+        falling at once pays.
+        """
+        air = state.variables["air_time"]
+        landed = self.touching(state) & (air > 0)
+        return ((air.clamp(max=longest) - shortest).clamp(min=0.0) * landed).sum(dim=-1)
+
+    def effort(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Regularisation: squares of torques, joint accelerations and changes of the action, ``(n,)``."""
+        variables, velocity = state.variables, state.qvel[:, 6:18]
+        torque = 80.0 * (self.control(action, state) - state.qpos[:, 7:19]) - 2.0 * velocity
+        acceleration = (velocity - variables["last_velocity"]) / self.control_timestep
+        change = (action.double().clamp(-1.0, 1.0) - variables["last_action"]) * ACTION_RANGE
+        return {
+            "torque": torque.clamp(-80.0, 80.0).square().sum(-1),
+            "acceleration": acceleration.square().sum(-1),
+            "action_rate": change.square().sum(-1),
+        }
+
+    def fallen(self, state: State, lowest: float) -> Tensor:
+        """Tilted by more than 60 degrees, or with the base below a height over the ground, ``(n,)``."""
+        base = state.qpos[:, None, 0:3]
+        height = base[:, 0, 2] - self.ground(state, base)[:, 0]
+        return (rotation(state)[:, 2, 2] < 0.5) | (height < lowest)
+
+    def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
+        """Friction and mass; scalars, hence invariant under the group."""
+        if self.friction is not None:
+            low, high = self.friction
+            draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
+            simulation.expand("geom_friction")[ids, :, 0] = draw[:, None]
+        if self.added_mass is not None:
+            low, high = self.added_mass
+            draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
+            body = self.model.body("base").id
+            simulation.expand("body_mass")[ids, body] = float(self.model.body_mass[body]) + draw
+            simulation.refresh(ids)
+
+
+def rotation(state: State) -> Tensor:
+    """Rotation of the base, ``(n, 3, 3)``: base frame to world."""
+    return state.shared("rotation", lambda: matrix_of(state.qpos[:, 3:7]))
+
+
+def matrix_of(quaternion: Tensor) -> Tensor:
+    """Rotation matrix of unit quaternions ``(n, 4)``, (w, x, y, z)."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def into_base(turn: Tensor, vector: Tensor) -> Tensor:
+    """World vectors ``(n, 3)`` in the base frame, given the base's rotation."""
+    return (turn * vector[:, :, None]).sum(dim=1)
+
+
+def _edit(timestep: float, payload: float, position: tuple[float, ...], weak_leg: str | None) -> Edit:
+    def edit(spec) -> None:
+        spec.option.timestep = timestep
+        if payload > 0:
+            body = spec.body("base").add_body(name="payload", pos=list(position))
+            body.add_geom(name="payload", size=[0.08, 0, 0], mass=payload, contype=0, conaffinity=0)
+        if weak_leg is not None:
+            for joint in ("HAA", "HFE", "KFE"):
+                spec.actuator(f"{weak_leg}_{joint}").forcerange = [-40.0, 40.0]
+
+    return edit

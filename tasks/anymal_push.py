@@ -1,0 +1,223 @@
+"""ANYmal-Push: walk to a cube and push it to a target, wherever around the robot the two are.
+
+Cube and target lie on one ray from the robot. Pushing forward, backward and to either side are then equally
+hard, and a policy without symmetry typically learns to turn and to use two of its legs only. The target
+moves farther away as pushes succeed.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tasks.anymal import Anymal, into_base, rotation
+from tasks.base import Entry, register
+from tasks.state import State
+from torchrl_sym import Representation
+from torchrl_sym.representations import invariant, polar
+
+CUBE = 0.25  # half its edge, m
+# Where the cube starts: distance from the robot, m, and how far a face is turned from it, rad.
+CUBE_DISTANCE, CUBE_TURN = (1.0, 1.3), 0.3
+# How far behind the cube the target is, m: 0.3 + 0.15 level U(0.5, 1), at most 1.35 at the last level.
+NEAREST_TARGET, TARGET_STEP, LAST_LEVEL = 0.3, 0.15, 7
+SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
+# Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
+STOP_DISTANCE = 0.12
+# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, m.
+SPEED, APPROACH_DISTANCE = 0.6, 0.25
+BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
+FALL_PENALTY = 5.0
+# Weights of the reward's terms. The first group is the task; the others ask for a gait that lasts.
+TASK_WEIGHTS = {"velocity": 4.0, "progress": 6.0, "tracking": 0.5}
+GAIT_WEIGHTS = {"alive": 0.5, "height": -20.0, "vertical": -1.0, "rolling": -0.05, "tilt": -1.0}
+EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.005}
+
+
+@register
+class AnymalPush(Anymal):
+    """Push a cube of 0.5 m and 5 kg to a target 0.3 to 1.35 m away.
+
+    Group: Klein four. Observation: 45 proprioceptive numbers, cube and target position in the base frame.
+    An episode succeeds if the cube ends within 0.2 m of the target.
+
+    Args:
+        curriculum: start with near targets and move them away as pushes succeed; if not, every episode
+            draws from the whole range.
+        **robot: arguments of :class:`~tasks.anymal.Anymal`.
+
+    Example:
+        >>> import torch
+        >>> task = AnymalPush()
+        >>> start = task.sample_goal_state(2, torch.Generator().manual_seed(0))
+        >>> task.observe(start).shape
+        torch.Size([2, 51])
+    """
+
+    name = "anymal_push"
+    asset = "anymal_push.xml"
+    episode_seconds = 7.0
+    observation_size = 51
+    goal_names = ("front left", "hind left", "front right", "hind right")
+
+    def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
+        super().__init__(**robot)
+        self.curriculum = curriculum
+        self._success_rate = math.nan
+        self._mean_level = 0.0
+
+    def layout(self) -> tuple[Entry, ...]:
+        """Proprioception, then where cube and target are."""
+        position = polar(self.robot.group)
+        return (
+            *self.proprioception(),
+            Entry("cube position", position, "m", "base", "polar vector"),
+            Entry("target position", position, "m", "base", "polar vector"),
+        )
+
+    def variables(self) -> dict[str, Representation]:
+        """Those of the robot; distances of cube and target one step ago and at the start, m."""
+        distance = invariant(self.robot.group, 1)
+        return super().variables() | {"distance": distance, "start_distance": distance}
+
+    def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
+        """Cube and target in front on the left, at any distance of the curriculum."""
+        level = torch.full((n,), float(LAST_LEVEL), dtype=torch.float64)
+        return self._start(level, generator, spread=0.0)
+
+    def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
+        """Any direction; near targets, or with ``curriculum=False`` the whole range."""
+        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        return self._turned(self._start(level, generator, spread=0.5), generator)
+
+    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+        """Judge whole episodes: the next target is farther after success, nearer after no progress."""
+        if not self.curriculum:
+            return self.sample_initial_state(len(finished), generator)
+        level = finished.variables["level"][:, 0].clone()
+        distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
+        fallen = self.fallen(finished, LOWEST)
+        whole = fallen | (finished.time > self.episode_seconds - self.control_timestep / 2)
+        success = whole & (distance < SUCCESS_DISTANCE) & ~fallen
+        failure = whole & ~success & (distance > 0.7 * start)
+        level = (level + success.double() - failure.double()).clamp(min=0.0)
+        anywhere = torch.randint(LAST_LEVEL + 1, level.shape, generator=generator).double()
+        level = torch.where(level > LAST_LEVEL, anywhere, level)
+        self._judge(success[whole], level)
+        return self._turned(self._start(level, generator, spread=0.5), generator)
+
+    def _judge(self, success: Tensor, level: Tensor) -> None:
+        if not len(success):
+            return
+        share = 1 - 0.998 ** len(success)  # an average over about the last 500 episodes
+        if math.isnan(self._success_rate):
+            self._success_rate, share = 0.0, 1.0
+        self._success_rate += share * (float(success.double().mean()) - self._success_rate)
+        self._mean_level += share * (float(level.mean()) - self._mean_level)
+
+    def _turned(self, state: State, generator: torch.Generator | None) -> State:
+        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
+        return self.transform_state(state, element)
+
+    def _start(self, level: Tensor, generator: torch.Generator | None, spread: float) -> State:
+        """Starts with the cube in front on the left and the target behind it.
+
+        Args:
+            level: curriculum level of every row, ``(n,)``.
+            generator: source of the draws.
+            spread: targets are at ``spread`` to 1 times the level's distance.
+        """
+        n = len(level)
+        u = torch.rand(n, 5, generator=generator, dtype=torch.float64)
+        yaw = (2 * u[:, 0] - 1) * math.pi
+        state = self.standing(n, yaw, generator)
+        state.variables["level"] = level[:, None].clone()
+        bearing = yaw + u[:, 1] * math.pi / 2
+        ray = torch.stack([bearing.cos(), bearing.sin()], dim=-1)
+        distance = CUBE_DISTANCE[0] + (CUBE_DISTANCE[1] - CUBE_DISTANCE[0]) * u[:, 2]
+        state.qpos[:, 19:21] = distance[:, None] * ray
+        state.qpos[:, 21] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        turn = bearing + (2 * u[:, 3] - 1) * CUBE_TURN
+        state.qpos[:, 22], state.qpos[:, 25] = (turn / 2).cos(), (turn / 2).sin()
+        reach = NEAREST_TARGET + TARGET_STEP * level * (spread + (1 - spread) * u[:, 4])
+        assert state.mocap_pos is not None
+        state.mocap_pos[:, 0, :2] = (distance + reach)[:, None] * ray
+        state.mocap_pos[:, 0, 2] = CUBE
+        state.variables["distance"] = reach[:, None].clone()
+        state.variables["start_distance"] = reach[:, None].clone()
+        return state
+
+    def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Those of the robot, and the distance of cube and target."""
+        return super().update(state, action) | {"distance": self._distance(state)[:, None]}
+
+    def _gap(self, state: State) -> Tensor:
+        """From the cube to the target, horizontally, ``(n, 2)``, m."""
+        assert state.mocap_pos is not None
+        return state.mocap_pos[:, 0, :2] - state.qpos[:, 19:21]
+
+    def _distance(self, state: State) -> Tensor:
+        return state.shared("distance", lambda: self._gap(state).norm(dim=-1))
+
+    def observe(self, state: State) -> Tensor:
+        """Proprioception, cube and target in the base frame."""
+        assert state.mocap_pos is not None
+        observation = torch.empty(len(state), 51)
+        self.observe_robot(state, observation)
+        turn, base = rotation(state), state.qpos[:, 0:3]
+        observation[:, 45:48] = into_base(turn, state.qpos[:, 19:22] - base)
+        observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - base)
+        return observation.clamp_(-20.0, 20.0)
+
+    def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Every term of the reward, weighted, per step; their sum is the reward."""
+        distance, gap = self._distance(state), self._gap(state)
+        pushing = distance > STOP_DISTANCE
+        ahead = gap / distance.clamp(min=1e-6)[:, None]
+        to_point = state.qpos[:, 19:21] - APPROACH_DISTANCE * ahead - state.qpos[:, 0:2]
+        asked = SPEED * to_point / to_point.norm(dim=-1, keepdim=True).clamp(min=1e-6) * pushing[:, None]
+        velocity, turning, turn = state.qvel[:, 0:3], state.qvel[:, 3:6], rotation(state)
+        progress = (state.variables["distance"][:, 0] - distance) / self.control_timestep
+        terms = {
+            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp(),
+            "progress": progress.clamp(-1.5, 1.5),
+            "tracking": 1 / (1 + (distance / 0.5).square()),
+            "alive": torch.ones_like(distance),
+            "height": (state.qpos[:, 2] - BASE_HEIGHT).square(),
+            "vertical": velocity[:, 2].square(),
+            "rolling": turning[:, :2].square().sum(-1),
+            "tilt": turn[:, 2, :2].square().sum(-1),
+            **self.effort(state, action),
+        }
+        weights = TASK_WEIGHTS | GAIT_WEIGHTS | EFFORT_WEIGHTS
+        weighted = {name: weights[name] * self.control_timestep * x for name, x in terms.items()}
+        weighted["step"] = self.first_touch(state) * pushing
+        weighted["fall"] = -FALL_PENALTY * self.fallen(state, LOWEST).double()
+        return weighted
+
+    def reward(self, state: State, action: Tensor) -> Tensor:
+        """Approach the cube from behind, move it towards the target, hold it there, walk well."""
+        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
+
+    def terminated(self, state: State) -> Tensor:
+        """The robot has fallen."""
+        return self.fallen(state, LOWEST)
+
+    def success(self, state: State) -> Tensor:
+        """The cube is within 0.2 m of the target, and the robot stands."""
+        return (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
+
+    def metrics(self) -> dict[str, float]:
+        """Success rate of about the last 500 training episodes and their mean level."""
+        return {"success": self._success_rate, "level": self._mean_level}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The averages that :meth:`metrics` reports; levels are part of the state of the rows."""
+        return {"success_rate": self._success_rate, "mean_level": self._mean_level}
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self._success_rate, self._mean_level = saved["success_rate"], saved["mean_level"]
