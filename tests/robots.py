@@ -71,8 +71,13 @@ def model(
     actuated: bool = True,
     floor: bool = True,
     cone: str = "elliptic",
+    objects: str = "",
+    more: str = "",
 ) -> mujoco.MjModel:
-    """Compile limbs that hang on the world; ``frames`` draws a random frame for every body."""
+    """Compile limbs that hang on the world; ``frames`` draws a random frame for every body.
+
+    MJCF of ``objects`` goes beside them into the world, that of ``more`` beside the world.
+    """
     joints = []
 
     def write(limb: Limb, parent: np.ndarray) -> str:
@@ -103,7 +108,7 @@ def model(
     )
     return mujoco.MjModel.from_xml_string(
         f"""<mujoco><option cone="{cone}" integrator="implicitfast" timestep="0.005"/>
-        <worldbody>{plane}{bodies}</worldbody><actuator>{motors}</actuator></mujoco>"""
+        <worldbody>{plane}{bodies}{objects}</worldbody><actuator>{motors}</actuator>{more}</mujoco>"""
     )
 
 

@@ -35,6 +35,8 @@ class Arguments:
     """reflect-x, reflect-y (left and right), klein_four, rotation-N or dihedral-N."""
     keyframe: str | None = None
     """A pose that the group keeps, by name; the model's reference pose by default."""
+    carried: tuple[str, ...] = ()
+    """Free or mocap bodies that a turn of the world only carries along, such as a cube under rotation-3."""
     out: Path | None = None
     """Where to write the model with everything averaged over the group (MJCF, six digits)."""
 
@@ -61,17 +63,18 @@ def main(arguments: Arguments) -> int:
     """Print the tables; returns the exit status."""
     group = named_group(arguments.group)
     model = mj.MjModel.from_xml_path(str(arguments.model))
-    report = audit(model, group, arguments.keyframe)
+    pose, carried = arguments.keyframe, arguments.carried
+    report = audit(model, group, pose, carried=carried)
     try:
-        tables = f"{derive(model, group, arguments.keyframe)}\n\n"
+        tables = f"{derive(model, group, pose, carried=carried)}\n\n"
     except ValueError:  # the report says why
         tables = ""
     sys.stdout.write(f"{tables}{report}\n")
     if arguments.out is not None and report.reason is None:
         spec = mj.MjSpec.from_file(str(arguments.model))
-        spec, changes = symmetrize_with_report(spec, group, arguments.keyframe)
+        spec, changes = symmetrize_with_report(spec, group, pose, carried=carried)
         arguments.out.write_text(spec.to_xml())
-        written = audit(mj.MjModel.from_xml_path(str(arguments.out)), group, arguments.keyframe)
+        written = audit(mj.MjModel.from_xml_path(str(arguments.out)), group, pose, carried=carried)
         sys.stdout.write(
             f"\n{changes}\n\nwritten to {arguments.out}: {written.verdict}\n"
             "(MJCF is written with six digits; for an exact model compile what symmetrize returns)\n"

@@ -10,6 +10,8 @@ rounding. It also warns of settings that make the solver itself break the symmet
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,13 +25,11 @@ from torchrl_sym.mujoco.links import (
     HINGE,
     SLIDE,
     Array,
-    Matcher,
-    MjData,
     MjModel,
+    carried_bodies,
     links_of,
     mj,
     name_of,
-    reference_pose,
 )
 from torchrl_sym.mujoco.report import AuditReport, Residual, phrase, simulation_warnings, unchecked_elements
 
@@ -42,7 +42,12 @@ _PLAIN_BIASES = (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE))
 
 
 def audit(
-    model: MjModel, group: PointGroup, keyframe: int | str | None = None, *, tolerance: float = 1e-8
+    model: MjModel,
+    group: PointGroup,
+    keyframe: int | str | None = None,
+    *,
+    tolerance: float = 1e-8,
+    carried: Sequence[str] = (),
 ) -> AuditReport:
     """How far each element of a group is from a symmetry of a model, term by term.
 
@@ -51,9 +56,12 @@ def audit(
         group: the group to try; it acts about the vertical axis through the world's origin.
         keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
         tolerance: largest residual that counts as exact.
+        carried: names of bodies that a turn of the world only carries along, as in
+            :func:`~torchrl_sym.mujoco.derive`; their shape and inertia need no symmetry.
 
     Raises:
-        KeyError: no such keyframe.
+        KeyError: no such keyframe, or no such body to be carried.
+        ValueError: a body that cannot be carried under any group.
 
     Example:
         >>> import mujoco
@@ -65,17 +73,17 @@ def audit(
         >>> audit(model, PointGroup.reflection("y")).verdict
         'approximate (largest residual 0.02: inertia, reflect-y, ...)'
     """
-    data = reference_pose(model, keyframe)
+    carried_bodies(model, carried)  # a mistake of the call is no finding about the model
     elements = tuple(group.names[1:])
     warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
     try:
-        symmetry = derive(model, group, keyframe)
+        symmetry = derive(model, group, keyframe, carried=carried)
     except ValueError as error:  # SymmetryError, or a group that tilts gravity or does not close
         return AuditReport(elements, (), tolerance, str(error), warnings, unchecked)
     rows: list[Residual] = []
     loose: dict[str, None] = {}
     for g, name in enumerate(elements, start=1):
-        run = _Element(model, data, symmetry, g)
+        run = _Element(symmetry, g)
         loose |= dict.fromkeys(run.compare())
         rows += [Residual(name, term, worst, part) for term, (worst, part) in run.worst.items()]
         unchecked += tuple(text for text in run.unchecked if text not in unchecked)
@@ -92,11 +100,12 @@ def audit(
 class _Element:
     """Compares everything in a model with its image under one element; ``worst`` holds the outcome."""
 
-    def __init__(self, model: MjModel, data: MjData, symmetry: ModelSymmetry, g: int) -> None:
-        self.model, self.data = model, data
-        self.links = links_of(model, data)
-        self.matcher = Matcher(model, data, self.links, symmetry.group.matrices[g].numpy())
-        self.action = symmetry._actions[g]
+    def __init__(self, symmetry: ModelSymmetry, g: int) -> None:
+        self.model, self.action = symmetry.model, symmetry._actions[g]
+        self.matcher = self.action.matcher
+        self.data, self.image = self.matcher.data, self.matcher.image
+        self.links = self.matcher.links
+        self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
         self.worst: dict[str, tuple[float, str]] = {}
         self.unchecked: list[str] = []
@@ -130,7 +139,7 @@ class _Element:
         for a, b in self.map.bodies.items():
             if a == 0:
                 continue
-            one, other, name = self.links[a], self.links[b], self._name("body", a, b)
+            one, other, name = self.links[a], self.image_links[b], self._name("body", a, b)
             self.add("mass", abs(one.mass - other.mass) / total, name)
             if min(one.mass, other.mass) > 0:
                 offset = float(np.linalg.norm(turn @ one.com - other.com))
@@ -142,7 +151,7 @@ class _Element:
                 self.add("gravity compensation", abs(float(lift[0] - lift[1])) / total, name)
 
     def _joints(self) -> None:
-        model, data, turn = self.model, self.data, self.matcher.matrix
+        model, data, turn = self.model, self.data, self.matcher.matrix  # no carried body has an axis
         rest = self.map.qpos @ model.qpos_spring + self.map.qpos_offset
         for i, j in self.map.joints.items():
             name, kind = self._name("joint", i, j), int(model.jnt_type[i])
@@ -308,7 +317,8 @@ class _Element:
         for a, b in self.map.bodies.items():
             one, other = ([x for x in self.links[k].bodies if model.body_mass[x] > 0] for k in (a, b))
             if a and len(one) == len(other) == 1:
-                axes = [self.data.ximat[body[0]].reshape(3, 3) for body in (one, other)]
+                ends = ((self.data, one), (self.image, other))
+                axes = [pose.ximat[body[0]].reshape(3, 3) for pose, body in ends]
                 turned = axes[1].T @ turn @ axes[0]
                 self.add("drag", float(np.abs(turned - turned.round()).max()), self._name("body", a, b))
             elif a and one:

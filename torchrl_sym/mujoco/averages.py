@@ -8,7 +8,7 @@ and shapes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -71,20 +71,31 @@ class Averager:
     """Reads averages off the compiled model and writes them into a copy of its specification."""
 
     def __init__(
-        self, spec: MjSpec, group: PointGroup, keyframe: int | str | None, tolerance: float
+        self,
+        spec: MjSpec,
+        group: PointGroup,
+        keyframe: int | str | None,
+        tolerance: float,
+        carried: Sequence[str],
     ) -> None:
         self.spec = spec.copy()
         self.spec.compiler.fusestatic = False  # fused bodies have no specification to write to
         self.model = self.spec.compile()
         self.tolerance, self.keyframe, self.group = tolerance, keyframe, group
-        self.actions = derive(self.model, group, keyframe, tolerance=tolerance)._actions
+        symmetry = derive(self.model, group, keyframe, tolerance=tolerance, carried=carried)
+        self.actions = symmetry._actions
+        self.carried = self.actions[0].matcher.carried
         self.turns = group.matrices.numpy()
         self.data = reference_pose(self.model, keyframe)
         self.links = links_of(self.model, self.data)
-        self.bodies: Maps = [action.coordinates.bodies for action in self.actions]
+        self.bodies: Maps = [
+            {a: b for a, b in action.coordinates.bodies.items() if a not in self.carried}
+            for action in self.actions
+        ]
         self.rotation = self.data.xmat.reshape(-1, 3, 3)
         self.extent = max(float(self.model.stat.extent), 1e-6)
-        self.report = SymmetrizeReport()
+        names = sorted(name_of(self.model, "body", b) for b in self.carried)
+        self.report = SymmetrizeReport(left=[f"body {name!r} is only carried along" for name in names])
 
     def _mean(self, maps: Maps, value: Callable[[int, int], Any]) -> dict[int, Array]:
         """Orbit averages of value(g, a), the image under g of element a's quantity."""
@@ -97,7 +108,9 @@ class Averager:
     def _closed(self, maps: Maps, kind: str) -> Maps:
         """The part of the maps on which the group acts; what has no image is noted in the report."""
         table = self.group.table
-        everything = set().union(*maps)
+        owner = self.model.body_weldid[getattr(self.model, f"{kind}_bodyid")]
+        own = {a for a, body in enumerate(owner) if int(body) in self.carried}
+        everything = set().union(*maps) - own
         good = {
             a
             for a in everything
@@ -109,7 +122,7 @@ class Averager:
             )
         }
         good = {a for a in good if all(m[a] in good for m in maps)}
-        missing = sorted(set(range(getattr(self.model, f"n{kind}"))) - good)
+        missing = sorted(set(range(len(owner))) - good - own)
         self.report.left += [f"{kind} {name_of(self.model, kind, a)!r} has no image" for a in missing]
         return [{a: m[a] for a in sorted(good)} for m in maps]
 
@@ -145,7 +158,7 @@ class Averager:
             mocap = model.body_mocapid[b] >= 0
             if free or mocap:
                 self.origin[b] = data.xpos[b].copy()
-                moved = means[b] - data.xpos[b]
+                moved = means.get(b, data.xpos[b]) - data.xpos[b]
                 if np.linalg.norm(moved) <= self.tolerance * self.extent and self.keyframe is None:
                     self.shift[b] = moved
             elif b:
@@ -170,7 +183,7 @@ class Averager:
             if turning:
                 self.moved[body] = anchors[turning[0]] - data.xanchor[turning[0]]
         for body, link in self.links.items():
-            if body:
+            if body and body not in self.carried:
                 self._write_body(body, link.joints, anchors, axes)
 
     def _write_body(self, body: int, joints: list[int], anchors: dict, axes: dict) -> None:
@@ -254,7 +267,7 @@ class Averager:
         if getattr(compiler, "settotalmass", -1.0) > 0:  # deprecated since MuJoCo 3.17
             compiler.settotalmass = -1.0
         compiler.balanceinertia = False
-        for b in self.links.keys() - {0}:
+        for b in self.links.keys() - {0} - self.carried:
             link, name, turn = links[b], name_of(model, "body", b), self.rotation[b]
             if not masses[b] > 0:
                 continue

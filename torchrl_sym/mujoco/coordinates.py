@@ -6,11 +6,14 @@ the image of link b, the part of the isometry that acts within the body frame is
 - a hinge or slide coordinate becomes q'_s(j) = sign_j q_j + offset_j, with the sign from its axis;
 - a free joint's position becomes R p, its rotation R X V_b^-1, its velocities R v (world) and d V_b w
   (body frame);
+- a body that is only carried along by a turn of the world keeps its own frame, V_b = I: its image is looked
+  for at R X_b, and its rotation becomes R X, its angular velocity stays;
 - a ball joint's rotation, relative to its parent p, becomes B_s(b)^T V_p B_b X V_b^-1 with B_b the fixed
   rotation of b in p.
 
 Rotations are kept proper by d R and d V. Quaternions are mapped by matrices L(q_R) R(q_V^-1); taking q_V =
-x_s(b)^-1 q_R x_b makes the unknown sign of q_R cancel, so that the matrices compose.
+x_s(b)^-1 q_R x_b makes the unknown sign of q_R cancel, so that the matrices compose. Where only L(q_R) is
+left, that of a carried body, the sign is the one with q_R^n = 1.
 """
 
 from __future__ import annotations
@@ -48,9 +51,11 @@ def map_coordinates(
 ) -> CoordinateMap:
     """Assemble the action from the images of links and joints; ``frames`` are the matrices V_b."""
     turn, det = matcher.matrix, matcher.det
-    q_turn = quaternion(det * turn)
-    rotation = {body: data.xmat[body].reshape(3, 3) for body in range(model.nbody)}
-    frames = {a: rotation[b].T @ turn @ rotation[a] for a, b in images.items()}
+    q_turn, image = matcher.lift, matcher.image
+    before, after = (each.xmat.reshape(-1, 3, 3) for each in (data, image))
+    frames = {
+        a: np.eye(3) if a in matcher.carried else after[b].T @ turn @ before[a] for a, b in images.items()
+    }
     out = CoordinateMap(
         joints,
         {},
@@ -65,7 +70,9 @@ def map_coordinates(
     )
 
     def q_frame(a: int) -> Array:  # x_s(b)^-1 q_R x_b, a lift of d V_b
-        return product(conjugate(data.xquat[images[a]]), product(q_turn, data.xquat[a]))
+        if a in matcher.carried:
+            return np.eye(4)[0]
+        return product(conjugate(image.xquat[images[a]]), product(q_turn, data.xquat[a]))
 
     for i, j in joints.items():
         kind, body = int(model.jnt_type[i]), int(model.jnt_bodyid[i])

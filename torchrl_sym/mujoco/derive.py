@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.coordinates import CoordinateMap, map_coordinates
+from torchrl_sym.mujoco.coordinates import CoordinateMap, map_coordinates, quaternion
 from torchrl_sym.mujoco.elements import (
     Image,
     SymmetryError,
@@ -24,9 +24,17 @@ from torchrl_sym.mujoco.elements import (
     map_sites,
     map_tendons,
 )
-from torchrl_sym.mujoco.links import Array, Matcher, MjModel, links_of, name_of, reference_pose
+from torchrl_sym.mujoco.links import (
+    Array,
+    Matcher,
+    MjModel,
+    carried_bodies,
+    links_of,
+    name_of,
+    reference_pose,
+)
 from torchrl_sym.mujoco.sensors import SensorMap, SensorMapper, sensor_matrices
-from torchrl_sym.representations import Representation
+from torchrl_sym.representations import Representation, orientations
 from torchrl_sym.representations.blocks import SignedPermutation, block_from_matrices
 
 Kind = Literal["joint", "actuator", "body", "site", "tendon", "sensor"]
@@ -38,6 +46,7 @@ def derive(
     keyframe: int | str | None = None,
     *,
     tolerance: float = 1e-2,
+    carried: Sequence[str] = (),
 ) -> ModelSymmetry:
     """How each element of a group acts on a model.
 
@@ -47,15 +56,21 @@ def derive(
         keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
         tolerance: largest mismatch of a joint that still counts as its image's: 1 - cos of the angle
             between the axes, plus the distance of the anchors relative to the model's extent.
+        carried: names of free bodies (one free joint) and mocap bodies that a turn of the world only
+            carries along: their rotation X becomes R X, their own frame stays. That is right for objects
+            of any shape, but exists for turns of odd order only. The rotation of other bodies becomes
+            R X V^-1, which is right for objects that have the group's symmetry themselves.
 
     Returns:
         The action on joints, actuators, sites, tendons and the full state. Whether masses, ranges and
         shapes agree as well is for :func:`~torchrl_sym.mujoco.audit` to say.
 
     Raises:
-        SymmetryError: a joint, actuator or tendon has no image; the message names it.
-        ValueError: the group tilts gravity.
-        KeyError: no such keyframe.
+        SymmetryError: a joint, actuator or tendon has no image, or a body cannot be carried by an
+            element; the message names it.
+        ValueError: the group tilts gravity, or a body that is neither free nor mocap, or that moving
+            bodies hang on, is to be carried.
+        KeyError: no such keyframe, or no such body to be carried.
 
     Example:
         >>> import mujoco
@@ -75,17 +90,35 @@ def derive(
                 f"{name!r} tilts gravity {gravity.tolist()}; use a group that fixes the vertical axis, or "
                 "switch gravity off in the model"
             )
+    objects = carried_bodies(model, carried)
+    lifts = _lifts(model, group, objects)
     data = reference_pose(model, keyframe)
     links = links_of(model, data)
     actions = []
-    for name, matrix in zip(group.names, group.matrices, strict=True):
-        matcher = Matcher(model, data, links, matrix.numpy())
+    for name, matrix, lift in zip(group.names, group.matrices, lifts, strict=True):
+        matcher = Matcher(model, data, links, matrix.numpy(), lift, objects)
         images = matcher.links_to()
         joints = _joint_images(model, matcher, images, name, tolerance)
         actions.append(
             _Action(model, matcher, map_coordinates(model, data, links, matcher, images, joints), tolerance)
         )
     return ModelSymmetry(model, group, actions)
+
+
+def _lifts(model: MjModel, group: PointGroup, carried: frozenset[int]) -> list[Array]:
+    """A quaternion of each element; where bodies are carried along, those that compose without a sign."""
+    if not carried:
+        return [quaternion(d * m) for d, m in zip(group.det.numpy(), group.matrices.numpy(), strict=True)]
+    try:
+        left = orientations.quaternion(group, "left").matrices
+    except ValueError as error:
+        names = ", ".join(name_of(model, "body", b) for b in sorted(carried))
+        reason = str(error).split(";")[0]  # its remedy is about observations
+        raise SymmetryError(
+            f"{names} cannot be carried along: {reason}; leave it out of `carried`, which maps its "
+            "rotation by conjugation, valid for an object that is symmetric under the group"
+        ) from error
+    return list(left[:, :, 0].numpy())  # of 1, for each element
 
 
 def _joint_images(
@@ -120,7 +153,7 @@ class _Action:
     def __init__(
         self, model: MjModel, matcher: Matcher, coordinates: CoordinateMap, tolerance: float
     ) -> None:
-        self.data = data = matcher.data
+        self.matcher, data = matcher, matcher.data
         self.tolerance = tolerance
         self.coordinates = coordinates
         self.sites = map_sites(model, data, matcher, coordinates.bodies, tolerance)
@@ -242,10 +275,8 @@ class ModelSymmetry:
     @functools.cached_property
     def _sensors(self) -> list[SensorMap]:
         return [
-            SensorMapper(
-                self.model, a.data, matrix.numpy(), a.coordinates, a.tendons, a.actuators, a.tolerance
-            ).map()
-            for a, matrix in zip(self._actions, self.group.matrices, strict=True)
+            SensorMapper(a.matcher, a.coordinates, a.tendons, a.actuators, a.tolerance).map()
+            for a in self._actions
         ]
 
     @functools.cached_property

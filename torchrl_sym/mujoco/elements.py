@@ -46,7 +46,7 @@ def map_sites(
         if not len(mine) or not len(theirs):
             continue
         moved = data.site_xpos[mine] @ matcher.matrix.T
-        cost = np.linalg.norm(moved[:, None] - data.site_xpos[theirs], axis=-1) / matcher.extent
+        cost = np.linalg.norm(moved[:, None] - matcher.image.site_xpos[theirs], axis=-1) / matcher.extent
         # sites in one place are told apart by their size and by staying where they are
         sizes = np.abs(model.site_size[mine][:, None] - model.site_size[theirs]).sum(-1)
         cost = cost + 1e-3 * sizes / matcher.extent + 1e-9 * (mine[:, None] != theirs)
@@ -201,7 +201,7 @@ def _dofs(model: MjModel, joint: int) -> int:
 
 def _site_frame(matcher: Matcher, a: int, b: int) -> Array:
     """V of a site: how a polar vector in the frame of site a becomes one in the frame of its image b."""
-    one, other = (matcher.data.site_xmat[site].reshape(3, 3) for site in (a, b))
+    one, other = matcher.data.site_xmat[a].reshape(3, 3), matcher.image.site_xmat[b].reshape(3, 3)
     return other.T @ matcher.matrix @ one
 
 

@@ -87,27 +87,27 @@ def shape_residual(model: MjModel, data: MjData, matcher: Matcher, a: int, b: in
     kind = int(model.geom_type[a])
     if kind != int(model.geom_type[b]):
         return _MISFIT
-    turn = matcher.matrix
+    turn, image = matcher.matrix, matcher.image
     if kind == _PLANE:  # infinite for contacts, so that only its height along the normal matters
-        normal = data.geom_xmat[b].reshape(3, 3)[:, 2]
+        normal = image.geom_xmat[b].reshape(3, 3)[:, 2]
         tilt = float(np.abs(turn @ data.geom_xmat[a].reshape(3, 3)[:, 2] - normal).max())
-        offset = turn @ data.geom_xpos[a] - data.geom_xpos[b]
+        offset = turn @ data.geom_xpos[a] - image.geom_xpos[b]
         return max(tilt, abs(float(normal @ offset)) / matcher.extent)
 
-    def at(geom: int, directions: Array) -> Array:
+    def at(pose: MjData, geom: int, directions: Array) -> Array:
         vertices = None
         if kind == _GEOM.mjGEOM_MESH:
             mesh = int(model.geom_dataid[geom])
             start = int(model.mesh_vertadr[mesh])
             vertices = model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])]
-        rotation = data.geom_xmat[geom].reshape(3, 3)
-        return support(kind, model.geom_size[geom], data.geom_xpos[geom], rotation, directions, vertices)
+        rotation = pose.geom_xmat[geom].reshape(3, 3)
+        return support(kind, model.geom_size[geom], pose.geom_xpos[geom], rotation, directions, vertices)
 
     return _support_gap(matcher, at, a, b)
 
 
-def _support_gap(matcher: Matcher, at: Callable[[int, Array], Array], a: int, b: int) -> float:
-    gap = np.abs(at(a, _DIRECTIONS @ matcher.matrix) - at(b, _DIRECTIONS))
+def _support_gap(matcher: Matcher, at: Callable[[MjData, int, Array], Array], a: int, b: int) -> float:
+    gap = np.abs(at(matcher.data, a, _DIRECTIONS @ matcher.matrix) - at(matcher.image, b, _DIRECTIONS))
     return float(gap.max()) / matcher.extent
 
 
@@ -215,9 +215,9 @@ def audit_sites(
 ) -> list[str]:
     """Residuals of the sites that something uses; returns the names of other sites out of place."""
 
-    def at(site: int, directions: Array) -> Array:
-        rotation, kind = data.site_xmat[site].reshape(3, 3), int(model.site_type[site])
-        return support(kind, model.site_size[site], data.site_xpos[site], rotation, directions)
+    def at(pose: MjData, site: int, directions: Array) -> Array:
+        rotation, kind = pose.site_xmat[site].reshape(3, 3), int(model.site_type[site])
+        return support(kind, model.site_size[site], pose.site_xpos[site], rotation, directions)
 
     images = map_sites(model, data, matcher, bodies, np.inf)
     used, loose = _used_sites(model), []
@@ -228,7 +228,7 @@ def audit_sites(
             residual, name = 1.0, f"{name_of(model, 'site', a)} (no image)"
         else:
             turned = matcher.matrix @ data.site_xpos[a]
-            residual = float(np.linalg.norm(turned - data.site_xpos[b])) / matcher.extent
+            residual = float(np.linalg.norm(turned - matcher.image.site_xpos[b])) / matcher.extent
             name = name_of(model, "site", a)
             name += f" -> {name_of(model, 'site', b)}" if a != b else ""
             if a in touch:  # such a sensor feels the contacts inside the site
@@ -305,7 +305,7 @@ def equality_residual(
         return min(float(gap), 1.0)
     turn = matcher.matrix
     owners, points, rotation = _ends(model, data, e)
-    owners_f, points_f, rotation_f = _ends(model, data, f)
+    owners_f, points_f, rotation_f = _ends(model, matcher.image, f)
     worst = 1.0
     for order in ([0, 1], [1, 0]):
         if [map_.bodies[owners[k]] for k in order] == owners_f:

@@ -12,6 +12,7 @@ pose that the symmetry keeps, the equations of motion are mapped onto each other
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
@@ -91,6 +92,37 @@ def links_of(model: MjModel, data: MjData) -> dict[int, Link]:
     return links
 
 
+def carried_bodies(model: MjModel, names: Sequence[str]) -> frozenset[int]:
+    """Numbers of the bodies that are only carried along by a turn of the world.
+
+    Raises:
+        KeyError: no such body; the message lists those that qualify.
+        ValueError: a body that is neither free nor mocap, or that moving bodies hang on.
+    """
+    kinds = model.jnt_type[model.body_jntadr] if model.njnt else np.full(model.nbody, -1)
+    loose = ((model.body_jntnum > 0) & (kinds == FREE)) | (model.body_mocapid >= 0)
+    known = {name_of(model, "body", b): b for b in range(model.nbody)}
+    found = set()
+    for name in (names,) if isinstance(names, str) else names:
+        if name not in known:
+            choice = [n for n, b in known.items() if loose[b]]
+            raise KeyError(f"no body {name!r} to be carried; free and mocap bodies are {choice}")
+        body = known[name]
+        if not loose[body]:
+            raise ValueError(
+                f"{name!r} cannot be carried: it is neither a free body (one free joint) nor a mocap body; "
+                "what hangs on a robot or is fixed is mapped with it"
+            )
+        below = np.flatnonzero((model.body_rootid == body) & (model.body_weldid != body))
+        if len(below):
+            raise ValueError(
+                f"{name!r} cannot be carried: {name_of(model, 'body', int(below[0]))!r} moves on it, and "
+                "only rigid bodies are carried along"
+            )
+        found.add(body)
+    return frozenset(found)
+
+
 def _lump(model: MjModel, data: MjData, link: Link) -> None:
     """Mass, centre of mass and inertia about it of all bodies of a link."""
     masses = model.body_mass[link.bodies]
@@ -112,16 +144,47 @@ class Matcher:
         data: kinematics at the reference pose.
         links: from :func:`links_of`.
         matrix: the isometry R, ``(3, 3)``; it acts about the origin of the world.
+        lift: quaternion of R, or of -R for a reflection.
+        carried: bodies that are only carried along, so that their frames turn with the world.
+
+    Attributes:
+        image: kinematics where images are looked for: the reference pose, carried bodies turned by R.
     """
 
-    def __init__(self, model: MjModel, data: MjData, links: dict[int, Link], matrix: Array) -> None:
+    def __init__(
+        self,
+        model: MjModel,
+        data: MjData,
+        links: dict[int, Link],
+        matrix: Array,
+        lift: Array,
+        carried: frozenset[int] = frozenset(),
+    ) -> None:
         self.model, self.data, self.links = model, data, links
-        self.matrix = matrix
+        self.matrix, self.lift, self.carried = matrix, lift, carried
+        self.image = self._carry() if carried else data
         self.det = round(float(np.linalg.det(matrix)))
         self.extent = max(float(model.stat.extent), 1e-6)
         self.total_mass = max(sum(link.mass for link in links.values()), 1e-12)
         self.total_inertia = max(max(np.trace(link.inertia) for link in links.values()), 1e-12)
         self._pair = functools.cache(self._pair_of_links)
+
+    def _carry(self) -> MjData:
+        model, data, image = self.model, self.data, mj.MjData(self.model)
+        image.qpos[:], image.mocap_pos[:], image.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
+        for body in self.carried:
+            turned = np.zeros(4)
+            mj.mju_mulQuat(turned, self.lift, data.xquat[body])
+            mocap = int(model.body_mocapid[body])
+            if mocap >= 0:
+                image.mocap_pos[mocap], image.mocap_quat[mocap] = self.matrix @ data.xpos[body], turned
+            else:
+                start = int(model.jnt_qposadr[model.body_jntadr[body]])
+                image.qpos[start : start + 3] = self.matrix @ data.xpos[body]
+                image.qpos[start + 3 : start + 7] = turned
+        mj.mj_kinematics(model, image)
+        mj.mj_comPos(model, image)
+        return image
 
     def links_to(self) -> dict[int, int]:
         """Image of every link, as a map of body numbers."""
@@ -173,11 +236,12 @@ class Matcher:
         if len(joints) != len(one.joints) or len(one.joints) != len(other.joints):
             cost += _MISFIT
         cost += sum(self.joint_cost(i, j) for i, j in joints.items())
-        if not one.children or not other.children:
-            return cost + _MISFIT * (len(one.children) != len(other.children)), []
-        table = np.array([[self._pair(c, d)[0] for d in other.children] for c in one.children])
+        own = [(c, c) for c in one.children if c in self.carried and a == b]
+        mine, theirs = ([c for c in link.children if c not in self.carried] for link in (one, other))
+        if not mine or not theirs:
+            return cost + _MISFIT * (len(mine) != len(theirs)), own
+        table = np.array([[self._pair(c, d)[0] for d in theirs] for c in mine])
         rows, columns = linear_sum_assignment(table)
         cost += float(table[rows, columns].sum())
-        cost += _MISFIT * abs(len(one.children) - len(other.children))
-        pairs = [(one.children[r], other.children[c]) for r, c in zip(rows, columns, strict=True)]
-        return cost, pairs
+        cost += _MISFIT * abs(len(mine) - len(theirs))
+        return cost, own + [(mine[r], theirs[c]) for r, c in zip(rows, columns, strict=True)]

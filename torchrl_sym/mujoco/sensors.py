@@ -22,7 +22,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.coordinates import CoordinateMap, conjugate, product, quaternion, sandwich
 from torchrl_sym.mujoco.elements import Image
-from torchrl_sym.mujoco.links import BALL, Array, MjData, MjModel, mj, name_of
+from torchrl_sym.mujoco.links import BALL, Array, Matcher, MjModel, mj, name_of
 
 _TYPES = {int(value): name.removeprefix("mjSENS_") for name, value in mj.mjtSensor.__members__.items()}
 _OBJECTS = {int(value): name.removeprefix("mjOBJ_") for name, value in mj.mjtObj.__members__.items()}
@@ -130,23 +130,22 @@ def _assign(cost: Array) -> list[tuple[int, int]]:
 
 @dataclass
 class SensorMapper:
-    """Finds the image of every sensor under one isometry ``turn``, from those of all it may measure."""
+    """Finds the image of every sensor under one isometry, from the images of all it may measure."""
 
-    model: MjModel
-    data: MjData
-    turn: Array
+    matcher: Matcher
     coordinates: CoordinateMap
     tendons: dict[int, Image]
     actuators: dict[int, Image]
     tolerance: float
 
     def __post_init__(self) -> None:
-        self.det = round(float(np.linalg.det(self.turn)))
-        self.extent = max(float(self.model.stat.extent), 1e-6)
+        self.model, self.data, self.image = self.matcher.model, self.matcher.data, self.matcher.image
+        self.turn, self.det, self.extent = self.matcher.matrix, self.matcher.det, self.matcher.extent
 
     def map(self) -> SensorMap:
         """Image and block of every sensor that has them; never an error."""
         mj.mj_camlight(self.model, self.data)  # cameras' frames, which only sensors need
+        mj.mj_camlight(self.model, self.image)
         out = SensorMap()
         classes: dict[tuple, list[int]] = {}
         for s in range(self.model.nsensor):
@@ -236,10 +235,10 @@ class SensorMapper:
             return min(self._pair_misfits(s, t))
         cost = self._place_misfit(kind, a, b, position=where != "link")
         if where == "body place":
-            cost += self._body_misfit(int(self.model.site_bodyid[a]), int(self.model.site_bodyid[b]))
+            cost += self._body_misfit(*(int(self.model.site_bodyid[site]) for site in (a, b)))
         if self.kind(s) == "RANGEFINDER":
-            z = [self._rotation("SITE", site)[:, 2] for site in (a, b)]
-            cost += float(np.linalg.norm(self.turn @ z[0] - z[1]))
+            frame = self._frame(("SITE", a), ("SITE", b))
+            cost += float(np.linalg.norm(frame[:, 2] - np.eye(3)[2]))
         if self.kind(s) in _AXES and cost < _MISFIT:
             cost += 1.0 - abs(self._axis(s, t))
         one, other = self.reference(s), self.reference(t)
@@ -253,8 +252,8 @@ class SensorMapper:
         one, other = self._link(kind, a), self._link(kind, b)
         if self.coordinates.bodies.get(one) != other:
             return _MISFIT
-        positions = getattr(self.data, _POSES[kind][0])
-        distance = float(np.linalg.norm(self.turn @ positions[a] - positions[b]))
+        positions = (getattr(pose, _POSES[kind][0]) for pose in (self.data, self.image))
+        distance = float(np.linalg.norm(self.turn @ next(positions)[a] - next(positions)[b]))
         return distance / self.extent * (1.0 if position else 1e-3 * self.tolerance)
 
     def _body_misfit(self, a: int, b: int) -> float:
@@ -366,13 +365,15 @@ class SensorMapper:
         )
 
     def _quaternion_block(self, s: int, t: int) -> Array:
-        q_turn = quaternion(self.det * self.turn)
+        q_turn = self.matcher.lift
 
         def lift(one: tuple[str, int] | None, other: tuple[str, int] | None) -> Array:
             if one is None or other is None:
                 return q_turn
-            x, image = quaternion(self._rotation(*one)), quaternion(self._rotation(*other))
-            return product(conjugate(image), product(q_turn, x))
+            if self._link(*one) in self.matcher.carried:
+                return quaternion(self._frame(one, other))
+            start, end = map(quaternion, self._rotations(one, other))
+            return product(conjugate(end), product(q_turn, start))
 
         frame = lift(self.object(s), self.object(t))
         return sandwich(lift(self.reference(s), self.reference(t)), conjugate(frame))
@@ -386,12 +387,14 @@ class SensorMapper:
         """The matrix V between the frames of two objects; R itself for the world's."""
         if one is None or other is None:
             return self.turn
-        return self._rotation(*other).T @ self.turn @ self._rotation(*one)
+        start, end = self._rotations(one, other)
+        return end.T @ self.turn @ start
 
     def _link(self, kind: str, index: int) -> int:
         owners = {"SITE": "site_bodyid", "GEOM": "geom_bodyid", "CAMERA": "cam_bodyid"}
         body = int(getattr(self.model, owners[kind])[index]) if kind in owners else index
         return int(self.model.body_weldid[body])
 
-    def _rotation(self, kind: str, index: int) -> Array:
-        return getattr(self.data, _POSES[kind][1])[index].reshape(3, 3)
+    def _rotations(self, one: tuple[str, int], other: tuple[str, int]) -> tuple[Array, Array]:
+        start, end = getattr(self.data, _POSES[one[0]][1]), getattr(self.image, _POSES[other[0]][1])
+        return start[one[1]].reshape(3, 3), end[other[1]].reshape(3, 3)

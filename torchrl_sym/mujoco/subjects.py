@@ -8,7 +8,7 @@ by what :func:`~torchrl_sym.mujoco.derive` finds in the model.
 from __future__ import annotations
 
 import abc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -22,6 +22,14 @@ from torchrl_sym.mujoco.links import MjModel, mj
 from torchrl_sym.symmetry import Symmetry
 
 Observation: TypeAlias = dict[NestedKey, Tensor]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where and how `derive` looks for a symmetry; its arguments."""
+
+    keyframe: int | str | None = None
+    carried: Sequence[str] = ()
 
 
 @dataclass
@@ -161,11 +169,11 @@ class PhysicsSubject(Subject):
         model: MjModel,
         symmetry: Symmetry,
         observe: Callable[[Any], Any] | None,
-        keyframe: int | str | None,
+        pose: Pose,
     ) -> None:
         super().__init__(symmetry, observe)
         self.model = model
-        self.robot = derive(model, symmetry.group, keyframe)
+        self.robot = derive(model, symmetry.group, pose.keyframe, carried=pose.carried)
 
     @abc.abstractmethod
     def observe(self) -> Observation:
@@ -212,8 +220,8 @@ class PhysicsSubject(Subject):
 class ControlSubject(PhysicsSubject):
     """A dm_control `Environment`: `physics` and `task`."""
 
-    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, keyframe: Any, seed: int) -> None:
-        super().__init__(env.physics.model.ptr, symmetry, observe, keyframe)
+    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> None:
+        super().__init__(env.physics.model.ptr, symmetry, observe, pose)
         self.env, self.data = env, env.physics.data.ptr
         self.substeps = round(env.control_timestep() / env.physics.timestep())
         spec = env.action_spec()
@@ -242,9 +250,9 @@ class ControlSubject(PhysicsSubject):
 class GymnasiumSubject(PhysicsSubject):
     """A gymnasium `MujocoEnv`, with wrappers that map single actions, observations or rewards."""
 
-    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, keyframe: Any, seed: int) -> None:
+    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> None:
         self.base = env.unwrapped
-        super().__init__(self.base.model, symmetry, observe, keyframe)
+        super().__init__(self.base.model, symmetry, observe, pose)
         self.data = self.base.data
         space = env.action_space
         self.low, self.high = (torch.as_tensor(np.array(x)).double() for x in (space.low, space.high))
@@ -281,7 +289,7 @@ def write_state(data: Any, state: Any, row: int = 0) -> None:
     data.time = float(torch.as_tensor(state.time).reshape(-1)[row])
 
 
-def subject_of(env: Any, symmetry: Symmetry, observe: Any, keyframe: Any, seed: int) -> Subject:
+def subject_of(env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> Subject:
     """The environment behind the interface, by what it offers.
 
     Raises:
@@ -291,10 +299,10 @@ def subject_of(env: Any, symmetry: Symmetry, observe: Any, keyframe: Any, seed: 
         if hasattr(env, "reset_to") and hasattr(getattr(env, "task", None), "transform_state"):
             return BatchedSubject(env, symmetry, observe, seed)
         if all(hasattr(env, name) for name in ("physics", "task", "action_spec")):
-            return ControlSubject(env, symmetry, observe, keyframe, seed)
+            return ControlSubject(env, symmetry, observe, pose, seed)
         base = getattr(env, "unwrapped", None)
         if all(hasattr(base, name) for name in ("model", "data", "set_state", "_get_obs")):
-            return GymnasiumSubject(env, symmetry, observe, keyframe, seed)
+            return GymnasiumSubject(env, symmetry, observe, pose, seed)
     raise TypeError(
         "expected a batched task environment (reset_to, task.transform_state), a dm_control Environment "
         f"(physics, task) or a gymnasium MujocoEnv (model, data, set_state, _get_obs), got "

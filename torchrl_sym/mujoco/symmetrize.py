@@ -12,7 +12,7 @@ is kept by every element, and equals x if x was kept already.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -44,7 +44,12 @@ _DOF_FIELDS = {
 
 
 def symmetrize(
-    spec: MjSpec, group: PointGroup, keyframe: int | str | None = None, *, tolerance: float = 1e-2
+    spec: MjSpec,
+    group: PointGroup,
+    keyframe: int | str | None = None,
+    *,
+    tolerance: float = 1e-2,
+    carried: Sequence[str] = (),
 ) -> MjSpec:
     """A copy of a model that is exactly symmetric; see :func:`symmetrize_with_report`.
 
@@ -58,11 +63,16 @@ def symmetrize(
         >>> symmetrize(spec, PointGroup.reflection("y")).compile().body("left").mass.item()
         1.0
     """
-    return symmetrize_with_report(spec, group, keyframe, tolerance=tolerance)[0]
+    return symmetrize_with_report(spec, group, keyframe, tolerance=tolerance, carried=carried)[0]
 
 
 def symmetrize_with_report(
-    spec: MjSpec, group: PointGroup, keyframe: int | str | None = None, *, tolerance: float = 1e-2
+    spec: MjSpec,
+    group: PointGroup,
+    keyframe: int | str | None = None,
+    *,
+    tolerance: float = 1e-2,
+    carried: Sequence[str] = (),
 ) -> tuple[MjSpec, SymmetrizeReport]:
     """A copy of a model that is exactly symmetric, and what was changed for it.
 
@@ -82,11 +92,15 @@ def symmetrize_with_report(
         keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
         tolerance: how far joints, sites and geoms may be from their image's, as in
             :func:`~torchrl_sym.mujoco.derive`.
+        carried: names of bodies that a turn of the world only carries along, as in
+            :func:`~torchrl_sym.mujoco.derive`. They need no symmetry and are left as they are.
 
     Raises:
-        SymmetryError: a joint or actuator has no image; the message names it.
+        SymmetryError: a joint or actuator has no image, or a body cannot be carried by an element; the
+            message names it.
+        KeyError: no such keyframe, or no such body to be carried.
     """
-    return _Averager(spec, group, keyframe, tolerance).run()
+    return _Averager(spec, group, keyframe, tolerance, carried).run()
 
 
 class _Averager(Averager):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,7 +22,7 @@ from scipy import stats
 from torch import Tensor
 
 from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
-from torchrl_sym.mujoco.subjects import Observation, Outcome, Subject, subject_of, write_state
+from torchrl_sym.mujoco.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
 from torchrl_sym.specs import image_of_box
 from torchrl_sym.symmetry import Symmetry
 
@@ -116,6 +116,7 @@ def verify(
     symmetry: Symmetry,
     *,
     keyframe: int | str | None = None,
+    carried: Sequence[str] = (),
     states: int = 16,
     steps: int = 10,
     tolerance: float = 1e-8,
@@ -146,6 +147,8 @@ def verify(
         symmetry: representations of the observation's entries (``"observation"`` for an array) and of
             ``"action"``. If it is not strict, entries it does not declare are not tested.
         keyframe: symmetric pose for ``derive``. Defaults to ``qpos0``.
+        carried: bodies that a turn of the world only carries along, for ``derive``. A batched task
+            environment maps its state itself and needs neither.
         states: number of states, rounded up to whole batches; of a batch larger than this, contact-free
             dynamics are tested on so many rows.
         steps: length of the roll-outs.
@@ -157,7 +160,7 @@ def verify(
         TypeError: an environment of another kind.
         KeyError: an observation, or the action, is not declared.
         ValueError: a size differs from its representation's.
-        SymmetryError: the model does not have the group.
+        SymmetryError: the model does not have the group, or a body cannot be carried by an element.
 
     Example:
         >>> import tasks
@@ -167,7 +170,7 @@ def verify(
     """
     if states < 1 or steps < 1:
         raise ValueError(f"expected at least one state and one step, got states={states}, steps={steps}")
-    subject = subject_of(env, symmetry, observe, keyframe, seed)
+    subject = subject_of(env, symmetry, observe, Pose(keyframe, carried), seed)
     if symmetry["action"].dim != len(subject.low):
         raise ValueError(
             f"'action': the environment takes {len(subject.low)} entries, its representation has "
