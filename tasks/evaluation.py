@@ -1,4 +1,4 @@
-"""Evaluation over equivalent goals: the return of each goal, and how much it differs between goals.
+"""Evaluation over equivalent goals: return, success and reward terms of each, and how much they differ.
 
 The group maps the canonical goal onto every equivalent one, so an optimal policy earns the same on
 all of them. The starts are paired: episode k of goal g is episode k of the canonical goal, mapped
@@ -9,8 +9,10 @@ Table I.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -24,11 +26,16 @@ from tasks.state import concatenate
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Undiscounted returns of one evaluation.
+    """What one evaluation measured: undiscounted returns, and where the task tells, more.
 
     Attributes:
         goal_names: names of the N equivalent goals, one per group element.
         returns: ``(N, episodes)`` float64; column k is one draw, mapped by every element.
+        successes: whether each episode reached its goal, ``(N, episodes)`` bool; None if the task has
+            no such notion (:meth:`~tasks.base.Task.success`).
+        terms: mean total per episode of every reward term by name, ``(N,)`` float64 each; they add up to
+            the mean returns. None if the task has no ``reward_terms``.
+        task_terms: the terms that make up the task, as opposed to gait and effort; may be empty.
 
     Example:
         >>> import torch
@@ -39,11 +46,14 @@ class Evaluation:
 
     goal_names: tuple[str, ...]
     returns: Tensor
+    successes: Tensor | None = None
+    terms: dict[str, Tensor] | None = None
+    task_terms: tuple[str, ...] = ()
 
     @property
     def goal_means(self) -> dict[str, float]:
         """Mean return of each goal."""
-        return dict(zip(self.goal_names, self.returns.mean(dim=1).tolist(), strict=True))
+        return self._by_goal(self.returns.mean(dim=1))
 
     @property
     def mean(self) -> float:
@@ -56,6 +66,26 @@ class Evaluation:
         means = self.returns.mean(dim=1)
         return float(means.max() - means.min())
 
+    @property
+    def goal_successes(self) -> dict[str, float]:
+        """Success rate of each goal; empty if the task has no notion of success."""
+        return {} if self.successes is None else self._by_goal(self.successes.double().mean(dim=1))
+
+    @property
+    def success(self) -> float | None:
+        """Success rate over all goals; None if the task has no notion of success."""
+        return None if self.successes is None else float(self.successes.double().mean())
+
+    @property
+    def task_means(self) -> dict[str, float]:
+        """Mean return of each goal from ``task_terms`` alone; empty if the task does not name them."""
+        if self.terms is None or not self.task_terms:
+            return {}
+        return self._by_goal(torch.stack([self.terms[name] for name in self.task_terms]).sum(dim=0))
+
+    def _by_goal(self, values: Tensor) -> dict[str, float]:
+        return dict(zip(self.goal_names, values.tolist(), strict=True))
+
 
 def evaluate(
     env: BatchedEnv | str,
@@ -64,21 +94,27 @@ def evaluate(
     seed: int = 0,
     *,
     num_threads: int = 2,
+    exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # pyright: ignore[reportArgumentType]
 ) -> Evaluation:
-    """Run one deterministic episode per goal and start state, all at once.
+    """Run one episode per goal and start state, all at once.
+
+    Success is judged at the last state of an episode; one whose simulation diverged has failed. Terms of
+    the reward are summed for tasks with a method ``reward_terms(state, action)``, a dictionary of ``(n,)``
+    by name; ``task_terms``, a tuple of names on the task's class, says which of them are the task.
 
     Args:
         env: an environment, whose task is evaluated in simulations of its own (the environment
             itself is not touched), or a task's name.
-        policy: writes ``"action"`` from ``"observation"``, for any batch size. Runs with
-            ``ExplorationType.DETERMINISTIC``, without gradients, in the mode (train, eval) it is
-            in.
+        policy: writes ``"action"`` from ``"observation"``, for any batch size. Runs without
+            gradients, in the mode (train, eval) it is in.
         episodes: episodes per goal.
-        seed: seed of the start states.
+        seed: seed of the start states and of sampled actions; torch's global generators are put back.
         num_threads: physics threads.
+        exploration: ``ExplorationType.RANDOM`` evaluates sampled actions. Starts are paired then too,
+            the noise of the actions is not.
 
     Returns:
-        The returns per goal and episode.
+        Returns, successes and terms, per goal.
 
     Raises:
         TypeError: ``env`` is neither a :class:`BatchedEnv` nor a name.
@@ -88,8 +124,8 @@ def evaluate(
         >>> from tensordict.nn import TensorDictModule
         >>> still = TensorDictModule(lambda x: torch.zeros_like(x[..., :1]), ["observation"], ["action"])
         >>> result = evaluate("cartpole", still, episodes=4, num_threads=1)
-        >>> result.goal_names, result.variation
-        (('right', 'left'), 0.0)
+        >>> result.goal_names, result.variation, result.success
+        (('right', 'left'), 0.0, None)
     """
     if isinstance(env, str):
         task, device = create(env), None
@@ -101,25 +137,59 @@ def evaluate(
             "environment of a transformed one, and a policy that reads its plain observation"
         )
     order = task.symmetry.group.order
-    canonical = task.sample_goal_state(episodes, torch.Generator().manual_seed(seed))
-    starts = [task.transform_state(canonical, g) for g in range(order)]
+    generator = torch.Generator().manual_seed(seed)
+    canonical = task.sample_goal_state(episodes, generator)
+    starts = concatenate([task.transform_state(canonical, g) for g in range(order)])
     batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, device=device)
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        returns = _run(batched, policy, batched.reset_to(concatenate(starts)))
-    return Evaluation(task.goal_names, returns.reshape(order, episodes).cpu())
+    noise_seed = int(torch.randint(2**31, (), generator=generator))  # not the stream of the starts
+    with torch.no_grad(), set_exploration_type(exploration), _seeded(noise_seed):
+        returns, successes, terms = _run(batched, policy, batched.reset_to(starts))
+    shape = (order, episodes)
+    return Evaluation(
+        task.goal_names,
+        returns.reshape(shape).cpu(),
+        None if successes is None else successes.reshape(shape),
+        {name: x.reshape(shape).mean(dim=1) for name, x in terms.items()} or None,
+        tuple(getattr(task, "task_terms", ())),
+    )
+
+
+@contextlib.contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Torch's global generators at a seed of their own, and as they were afterwards."""
+    devices = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
+    with torch.random.fork_rng(devices):
+        torch.default_generator.manual_seed(seed)
+        if devices:  # torch.manual_seed would reach devices that nothing restores
+            torch.cuda.manual_seed_all(seed)
+        yield
 
 
 def _run(
     env: BatchedEnv,
     policy: Callable[[TensorDictBase], TensorDictBase],
     tensordict: TensorDictBase,
-) -> Tensor:
-    """Return of the first episode of every row, ``(n, 1)`` float64."""
+) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
+    """First episode of every row: return ``(n, 1)``, success ``(n,)`` and total of each term ``(n,)``."""
+    task: Any = env.task  # reward_terms is optional
     running = ~tensordict["done"]
     returns = torch.zeros(running.shape, dtype=torch.float64, device=running.device)
+    successes = task.success(env.state)  # every entry is replaced where its episode ends
+    totals: dict[str, Tensor] = {}
     while bool(running.any()):
+        before = env.state.variables
         tensordict = env.step(policy(tensordict))
+        counted = running.squeeze(-1).cpu() & ~env.simulation.diverged()
         returns += tensordict["next", "reward"].double() * running
-        running &= ~tensordict["next", "done"]
+        if hasattr(task, "reward_terms"):
+            state = env.state
+            state.variables = before  # the reward sees the variables from before the step
+            for name, value in task.reward_terms(state, tensordict["action"].cpu()).items():
+                totals[name] = totals.get(name, 0.0) + value.double().masked_fill(~counted, 0.0)
+        ended = running & tensordict["next", "done"]
+        if successes is not None and bool(ended.any()):
+            reached = task.success(env.state) & counted
+            successes = torch.where(ended.squeeze(-1).cpu(), reached, successes)
+        running &= ~ended
         tensordict = step_mdp(tensordict)
-    return returns
+    return returns, successes, totals

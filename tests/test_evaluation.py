@@ -3,10 +3,15 @@
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
+from torchrl.envs.utils import ExplorationType
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
-from tests.task_helpers import Falling, make
+from tests.task_helpers import Falling, all_tasks, make
+
+# Rewards of a step are summed in float64 but pass through the environment as float32.
+CLOSE = {"rtol": 1e-5, "atol": 1e-6}
 
 
 def test_evaluate_needs_a_task():
@@ -79,3 +84,118 @@ def test_variation_is_the_largest_difference_between_goals():
     assert result.variation == 5.5
     assert result.mean == 2.5
     assert result.goal_means == {"a": 2.0, "b": 0.0, "c": 5.5}
+
+
+class Measured(Falling):
+    """Success where the pole is on the right; terms, one of which sees a variable from before the step."""
+
+    task_terms = ("upright", "smooth")
+
+    def variables(self):
+        return {"last_action": self.robot.actuators}
+
+    def sample_goal_state(self, n, generator):
+        state = super().sample_goal_state(n, generator)
+        state.variables["last_action"] = torch.zeros(n, 1, dtype=torch.float64)
+        return state
+
+    def update(self, state, action):
+        return {"last_action": action.double()}
+
+    def reward_terms(self, state, action):
+        change = action.double() - state.variables["last_action"]
+        return {
+            "upright": self.observe(state)[:, 1].abs().double(),
+            "smooth": -change.square().sum(-1),
+            "alive": torch.full((len(state),), 0.5, dtype=torch.float64),
+        }
+
+    def reward(self, state, action):
+        return sum(self.reward_terms(state, action).values())
+
+    def success(self, state):
+        return state.qpos[:, 1] > 0
+
+
+def noisy(scale=1.0):
+    return ProbabilisticActor(
+        TensorDictModule(
+            lambda x: (torch.zeros_like(x[..., :1]), torch.full_like(x[..., :1], scale)),
+            ["observation"], ["loc", "scale"],
+        ),
+        in_keys=["loc", "scale"], distribution_class=IndependentNormal,
+    )  # fmt: skip
+
+
+def test_terms_add_up_to_the_return():
+    env = BatchedEnv(Measured(episode_seconds=1.0), 1, num_threads=1)
+    result = evaluate(env, noisy(), 20, num_threads=1, exploration=ExplorationType.RANDOM)
+    assert list(result.terms) == ["upright", "smooth", "alive"]
+    assert (result.terms["smooth"] < -1.0).all()  # the action did change
+    torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
+    expected = (result.returns.mean(dim=1) - result.terms["alive"]).tolist()
+    assert list(result.task_means.values()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_success_is_judged_at_the_end_of_the_first_episode():
+    env = BatchedEnv(Measured(episode_seconds=1.0), 1, num_threads=1)
+    result = evaluate(env, noisy(), 20, num_threads=1)
+    assert result.successes.shape == (2, 20) and result.successes.dtype == torch.bool
+    # A pole left alone falls on the side where it starts, and its episode ends before it hangs.
+    assert result.goal_successes == {"right": 1.0, "left": 0.0}
+    assert result.success == 0.5
+
+
+def test_a_simulation_that_diverged_has_failed_and_earns_nothing_more():
+    def policy(tensordict):
+        action = torch.zeros(tensordict.shape[0], 1)
+        if len(calls) == 3:
+            action[1] = torch.nan
+        calls.append(1)
+        return tensordict.set("action", action)
+
+    class Always(Measured):
+        def success(self, state):
+            return torch.ones(len(state), dtype=torch.bool)
+
+    calls = []
+    env = BatchedEnv(Always(episode_seconds=1.0), 1, num_threads=1)
+    result = evaluate(env, policy, 3, num_threads=1)
+    assert result.successes.tolist() == [[True, False, True], [True, True, True]]
+    torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
+    assert result.returns[0, 1] < 0.5 * result.returns[0, 0]
+
+
+def test_tasks_without_success_and_terms():
+    result = evaluate("cartpole", noisy(), 2, num_threads=1)
+    assert result.successes is result.success is result.terms is None
+    assert result.goal_successes == result.task_means == {}
+
+
+def test_sampled_actions_follow_the_seed_and_leave_the_random_numbers_alone():
+    def returns(seed, scale=1.0, exploration=ExplorationType.RANDOM):
+        return evaluate(env, noisy(scale), 4, seed, num_threads=1, exploration=exploration).returns
+
+    env = make("cartpole", episode_seconds=0.2)
+    rng = torch.get_rng_state()
+    first = returns(0)
+    assert torch.equal(torch.get_rng_state(), rng)
+    torch.rand(3)
+    assert torch.equal(returns(0), first)
+    assert not torch.equal(returns(1), first)
+    # The noise of the actions is not paired; without it, mirrored starts earn the same.
+    assert not torch.equal(first[0], first[1])
+    still = returns(0, exploration=ExplorationType.DETERMINISTIC)
+    assert torch.equal(still[0], still[1])
+
+
+@all_tasks
+def test_terms_of_every_task_add_up_to_its_return(name):
+    env = make(name, num_envs=1, episode_seconds=0.2)
+    still = torch.zeros(env.task.action_size)
+    policy = TensorDictModule(lambda x: still.expand(len(x), -1), ["observation"], ["action"])
+    result = evaluate(env, policy, 2, num_threads=1)
+    assert result.returns.shape == (len(env.task.goal_names), 2)
+    if result.terms is not None:
+        torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
+        assert set(result.task_terms) <= set(result.terms)
