@@ -65,7 +65,12 @@ def random_rotation(rng: np.random.Generator) -> np.ndarray:
     return out.reshape(3, 3)
 
 
-def model(
+def model(*limbs: Limb, **options) -> mujoco.MjModel:
+    """Compile what :func:`mjcf` writes."""
+    return mujoco.MjModel.from_xml_string(mjcf(*limbs, **options))
+
+
+def mjcf(
     *limbs: Limb,
     frames: np.random.Generator | None = None,
     actuated: bool = True,
@@ -73,8 +78,8 @@ def model(
     cone: str = "elliptic",
     objects: str = "",
     more: str = "",
-) -> mujoco.MjModel:
-    """Compile limbs that hang on the world; ``frames`` draws a random frame for every body.
+) -> str:
+    """Limbs that hang on the world; ``frames`` draws a random frame for every body.
 
     MJCF of ``objects`` goes beside them into the world, that of ``more`` beside the world.
     """
@@ -106,10 +111,8 @@ def model(
     motors = (
         "".join(f'<position name="{j}" joint="{j}" kp="80" kv="2"/>' for j in joints) if actuated else ""
     )
-    return mujoco.MjModel.from_xml_string(
-        f"""<mujoco><option cone="{cone}" integrator="implicitfast" timestep="0.005"/>
+    return f"""<mujoco><option cone="{cone}" integrator="implicitfast" timestep="0.005"/>
         <worldbody>{plane}{bodies}{objects}</worldbody><actuator>{motors}</actuator>{more}</mujoco>"""
-    )
 
 
 def text(values) -> str:

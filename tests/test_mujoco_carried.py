@@ -4,10 +4,15 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from dm_control import mujoco as dm_mujoco
+from dm_control.rl import control
+from dm_control.suite import base
 
-from tests.robots import anymal, model, text, trifinger
-from torchrl_sym import PointGroup
-from torchrl_sym.mujoco import SymmetryError, audit, derive
+from tests.robots import anymal, mjcf, model, text, trifinger
+from torchrl_sym import PointGroup, Symmetry
+from torchrl_sym.mujoco import SymmetryError, audit, derive, symmetrize_with_report, verify
+from torchrl_sym.mujoco.__main__ import Arguments, main
+from torchrl_sym.representations import polar, quaternion
 
 C3 = PointGroup.rotation(3)
 CARRIED = ("cube", "goal")
@@ -22,25 +27,31 @@ def rotation(seed: int) -> str:
     return text(q / np.linalg.norm(q))
 
 
-def scene(edges: np.ndarray = CUBE, more: str = "", inertia: str = "", frames: int = 1) -> mujoco.MjModel:
+def written(edges: np.ndarray = CUBE, more: str = "", inertia: str = "", frames: int | None = 1) -> str:
     """TriFinger, a free block 1 mm above the table (touching breaks exactness), and a goal for it."""
     inertia = inertia or f'<inertial pos="0 0 0" mass=".094" diaginertia="{text([6.6e-5] * 3)}"/>'
     block = f'<geom name="{{}}" type="box" size="{text(edges)}" {{}}/>'
     objects = f"""<body name="cube" pos=".01 -.02 {edges[2] + 1e-3}"><freejoint name="cube"/>{inertia}
-        {block.format("cube", "")}<site name="cube" pos=".01 .02 .01" quat="{rotation(3)}"/></body>
+        {block.format("cube", "")}<camera name="cube" pos=".01 0 .02" quat="{rotation(6)}"/>
+        <site name="cube" pos=".01 .02 .01" quat="{rotation(3)}" size=".05"/></body>
       <body name="goal" mocap="true" pos=".05 .03 .1" quat="{rotation(4)}">
         {block.format("goal", 'contype="0" conaffinity="0"')}
         <site name="goal" pos="0 .01 0" quat="{rotation(5)}"/></body>"""
-    return model(*trifinger(), frames=np.random.default_rng(frames), objects=objects, more=more)
+    rng = None if frames is None else np.random.default_rng(frames)
+    return mjcf(*trifinger(), frames=rng, objects=objects, more=more)
 
 
-def uneven(seed: int) -> mujoco.MjModel:
+def scene(*args, **options) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(written(*args, **options))
+
+
+def uneven(seed: int) -> str:
     """A block with no symmetry at all: three different edges, any inertia in any frame off its middle."""
     rng = np.random.default_rng(seed)
     moments = rng.uniform(4e-5, 6e-5, 3)
     inertia = f"""<inertial pos="{text(rng.uniform(-0.008, 0.008, 3))}" quat="{rotation(seed)}" mass=".1"
       diaginertia="{text(moments)}"/>"""
-    return scene(rng.permutation(BOX) * rng.uniform(0.9, 1.1, 3), inertia=inertia)
+    return written(rng.permutation(BOX) * rng.uniform(0.9, 1.1, 3), inertia=inertia)
 
 
 def start(compiled: mujoco.MjModel, seed: int) -> mujoco.MjData:
@@ -90,9 +101,7 @@ def residual(robot, g: int, seed: int, steps: int, warm_up: int = 0) -> tuple[fl
 SCENES = {
     "cube": scene(),
     "tethered to the goal": scene(more=TETHER),
-    "uneven 0": uneven(0),
-    "uneven 1": uneven(1),
-    "uneven 2": uneven(2),
+    **{f"uneven {k}": mujoco.MjModel.from_xml_string(uneven(k)) for k in range(3)},
 }
 
 
@@ -173,3 +182,165 @@ def test_wrong_requests_name_the_body_and_the_remedy():
     reason = audit(compiled, PointGroup.klein_four(), carried=["cube"]).reason
     assert reason is not None
     assert reason.startswith("cube cannot be carried along: 'reflect-x' is a reflection")
+
+
+# --- audit, sensors, averages
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_audit_is_exact_with_carried_objects_only(name):
+    report = audit(SCENES[name], C3, carried=CARRIED)
+    assert report.exact, str(report)
+    without = audit(SCENES[name], C3)
+    assert without.reason is not None
+    assert {"goal", "cube"} & set(without.reason.replace(",", " ").split())
+    assert not audit(SCENES[name], C3, carried=["goal"]).exact
+
+
+def test_audit_still_finds_what_is_wrong_with_the_fingers_and_the_damping_of_a_carried_body():
+    compiled = scene()
+    compiled.body_mass[compiled.body("finger120_1").id] *= 1.05
+    compiled.dof_damping[-6:-3] = (0.1, 0.1, 0.3)  # about the vertical: kept
+    report = audit(compiled, C3, carried=CARRIED)
+    assert {row.term for row in report.residuals if row.residual > 1e-8} == {"mass"}
+    compiled.dof_damping[-6] = 0.2
+    terms = {row.term for row in audit(compiled, C3, carried=CARRIED).residuals if row.residual > 1e-8}
+    assert "damping" in terms
+
+
+SENSORS = [
+    *(
+        f'<{kind} site="cube"/>'
+        for kind in ("accelerometer", "velocimeter", "gyro", "magnetometer", "force", "torque", "touch")
+    ),
+    *(
+        f'<{kind} {of} {reference}/>'
+        for kind in ("framepos", "framequat", "framexaxis", "framezaxis")
+        for of in (
+            *(f'objtype="{o}" objname="cube"' for o in ("xbody", "body", "geom", "site", "camera")),
+            'objtype="site" objname="goal"',
+        )
+        for reference in ("", 'reftype="site" refname="goal"', 'reftype="camera" refname="cube"')
+    ),
+    *(
+        f'<{kind} objtype="site" objname="cube" {reference}/>'
+        for kind in ("framepos", "framequat", "framelinvel", "frameangvel", "frameyaxis")
+        for reference in ("", *(f'reftype="xbody" refname="finger{k}_2"' for k in (0, 120, 240)))
+    ),
+    *(
+        f'<{kind} objtype="xbody" objname="finger{k}_2" reftype="site" refname="cube"/>'
+        for kind in ("framepos", "framequat", "framelinvel", "frameangvel")
+        for k in (0, 120, 240)
+    ),
+    *(f'<framelinacc objtype="{o}" objname="cube"/><frameangacc objtype="{o}" objname="cube"/>'
+      for o in ("xbody", "site")),
+    *(f'<{kind} cutoff=".3" body1="finger{k}_2" geom2="cube"/>'
+      for kind in ("distance", "normal", "fromto") for k in (0, 120, 240)),
+    '<subtreecom body="cube"/><subtreelinvel body="cube"/><subtreeangmom body="cube"/>',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("frames", [None, 1])
+def test_sensors_on_carried_bodies(frames):
+    option = f'<option magnetic="0 0 -.5"/><sensor>{"".join(SENSORS)}</sensor>'
+    robot = derive(scene(BOX, option, frames=frames), C3, carried=CARRIED)
+    compiled, quaternions = robot.model, int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)
+    for seed in range(6):
+        data = start(compiled, seed)
+        mujoco.mj_step(compiled, data, 20)
+        for g in range(3):
+            image = image_of(robot, data, g)
+            for each in (data, image):
+                mujoco.mj_forward(compiled, each)
+            expected = robot.sensordata(torch.tensor(data.sensordata), g).numpy()
+            for s in range(compiled.nsensor):
+                part = slice(compiled.sensor_adr[s], compiled.sensor_adr[s] + compiled.sensor_dim[s])
+                a, b = image.sensordata[part], expected[part]
+                sign = -1 if compiled.sensor_type[s] == quaternions and a @ b < 0 else 1
+                assert np.abs(a - sign * b).max() <= 1e-8 * max(1, np.abs(b).max()), SENSORS[s]
+
+
+def test_symmetrize_leaves_carried_bodies_and_evens_the_fingers():
+    spec = mujoco.MjSpec.from_string(uneven(0))
+    spec.body("finger120_1").mass *= 1.03
+    before = spec.compile()
+    assert not audit(before, C3, carried=CARRIED).exact
+    even, report = symmetrize_with_report(spec, C3, carried=CARRIED)
+    after = even.compile()
+    assert audit(after, C3, carried=CARRIED).exact
+    assert {change.name for change in report.changes} == {f"finger{k}_1" for k in (0, 120, 240)}
+    assert report.left == ["body 'cube' is only carried along", "body 'goal' is only carried along"]
+    for name in CARRIED:
+        for values in ("pos", "quat", "ipos", "iquat", "inertia", "mass"):
+            one, other = (getattr(m.body(name), values) for m in (before, after))
+            np.testing.assert_allclose(other, one, atol=1e-15)
+        for kind in ("geom", "site"):
+            for values in ("pos", "quat", "size"):
+                one, other = (getattr(getattr(m, kind)(name), values) for m in (before, after))
+                np.testing.assert_allclose(other, one, atol=1e-15)
+
+
+# --- environments and the command line
+
+
+PUSHERS = "".join(
+    f"""<body pos="{text(np.array([np.cos(a), np.sin(a), 0]) * 0.3)}" euler="0 0 {float(np.degrees(a))!r}">
+      <joint name="push{k}" type="slide" axis="-1 0 0" damping="4" range="-.1 .24"/>
+      <geom type="sphere" size=".03" mass=".2" pos="0 0 .04"/></body>"""
+    for k, a in enumerate(2 * np.pi / 3 * np.arange(3))
+)
+TABLE = f"""<mujoco><option cone="elliptic" timestep=".005"/>
+  <worldbody><geom type="plane" size="1 1 .1"/>{PUSHERS}
+    <body name="block" pos="0 0 .031"><freejoint/><geom type="box" size="{text(BOX)}" mass=".1"/></body>
+    <body name="goal" mocap="true" pos="0 0 .1"/></worldbody>
+  <actuator>{"".join(f'<motor joint="push{k}" ctrlrange="-1 1"/>' for k in range(3))}</actuator></mujoco>"""
+
+
+class Push(base.Task):
+    """Push a block, of three different edges, to where the goal is."""
+
+    def initialize_episode(self, physics) -> None:
+        physics.data.qpos[:3] = self.random.uniform(0, 0.15, 3)
+        angles = self.random.uniform(0, 4 * np.pi, 2) / 2  # both signs of a quaternion alike
+        radius, way = 0.03 * np.sqrt(self.random.uniform()), self.random.uniform(0, 2 * np.pi)
+        physics.data.qpos[3:5] = radius * np.cos(way), radius * np.sin(way)
+        physics.data.qpos[6:] = np.cos(angles[0]), 0, 0, np.sin(angles[0])
+        physics.data.mocap_quat[:] = np.cos(angles[1]), 0, 0, np.sin(angles[1])
+        super().initialize_episode(physics)
+
+    def get_observation(self, physics) -> dict:
+        data = physics.data
+        return {
+            "joints": data.qpos[:3],
+            "at": data.qpos[3:6],
+            "turn": data.qpos[6:],
+            "goal": data.mocap_quat,
+        }
+
+    def get_reward(self, physics) -> float:
+        return float(np.dot(physics.data.qpos[6:], physics.data.mocap_quat[0]) ** 2)
+
+
+def test_verify_with_carried_objects():
+    env = control.Environment(dm_mujoco.Physics.from_xml_string(TABLE), Push(random=0))
+    robot = derive(env.physics.model.ptr, C3, carried=["block", "goal"])
+    turned = quaternion(C3, "left")
+    entries = {"joints": robot.joint_positions, "at": polar(C3), "turn": turned, "goal": turned}
+    symmetry = Symmetry(C3, {**entries, "action": robot.actuators})
+    report = verify(env, symmetry, carried=["block", "goal"], states=24, steps=5)
+    assert report.passed, str(report)
+    assert report.contacts > 12
+    wrong = verify(env, symmetry, states=8, steps=5)
+    assert wrong.worst.part in ("contact", "dynamics")
+
+
+def test_command_line(tmp_path, capsys):
+    path = tmp_path / "push.xml"
+    path.write_text(TABLE)
+    assert main(Arguments(path, group="rotation-3", carried=("block", "goal"))) == 0
+    assert "exact" in capsys.readouterr().out.splitlines()
+    out = tmp_path / "out.xml"
+    assert main(Arguments(path, group="rotation-3", carried=("block", "goal"), out=out)) == 0
+    assert out.exists()
+    main(Arguments(path, group="rotation-3"))
+    assert "exact" not in capsys.readouterr().out.splitlines()[-3:]
