@@ -8,6 +8,7 @@ from dm_control import mujoco as dm_mujoco
 from dm_control.rl import control
 from dm_control.suite import base
 
+from tests import robots
 from tests.robots import anymal, mjcf, model, text, trifinger
 from torchrl_sym import PointGroup, Symmetry
 from torchrl_sym.mujoco import SymmetryError, audit, derive, symmetrize_with_report, verify
@@ -151,6 +152,24 @@ def matrix_of(q: torch.Tensor) -> torch.Tensor:
     out = np.zeros(9)
     mujoco.mju_quat2Mat(out, (q / q.norm()).numpy())
     return torch.as_tensor(out).reshape(3, 3)
+
+
+def test_carried_bodies_are_matched_with_themselves_at_any_pose():
+    """Not so without: of three equal cubes round the axis, each is the image of another."""
+    cubes = "".join(
+        f"""<body name="c{k}" pos="{text(robots.turn(120 * k) @ (0.1, 0.0, 0.0335))}" euler="0 0 {120 * k}">
+          <freejoint/><geom type="box" size="{text(CUBE)}" mass=".1"/></body>"""
+        for k in range(3)
+    )
+    pose = " ".join(f".{k} .1 .2 {rotation(k)}" for k in range(3))
+    compiled = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody>{cubes}</worldbody><keyframe><key qpos="{pose}"/></keyframe></mujoco>"""
+    )
+    assert derive(compiled, C3).table("body", 1)["c0"] == "c1"
+    one, other = (derive(compiled, C3, key, carried=["c0", "c1", "c2"]) for key in (None, 0))
+    assert one.table("body", 1) == {name: name for name in ("world", "c0", "c1", "c2")}
+    qpos = torch.randn(4, 21, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    torch.testing.assert_close(one.map_qpos(qpos, 2), other.map_qpos(qpos, 2))
 
 
 def test_one_element_per_row():
