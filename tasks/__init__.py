@@ -6,7 +6,8 @@ the names.
 
 from typing import TYPE_CHECKING, Any
 
-from tasks import anymal_push as anymal_push  # importing a task's file registers the task
+from tasks import anymal_climb as anymal_climb
+from tasks import anymal_push as anymal_push
 from tasks import base
 from tasks import cartpole as cartpole
 from tasks.environment import make_env

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from tasks.anymal import Anymal, into_base, rotation
 from tasks.base import Entry, register
+from tasks.curriculum import Averages, next_level
 from tasks.state import State
 from torchrl_sym import Representation
 from torchrl_sym.representations import invariant, polar
@@ -66,8 +67,7 @@ class AnymalPush(Anymal):
     def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
         super().__init__(**robot)
         self.curriculum = curriculum
-        self._success_rate = math.nan
-        self._mean_level = 0.0
+        self.averages = Averages("success", "level")
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, then where cube and target are."""
@@ -95,28 +95,17 @@ class AnymalPush(Anymal):
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: the next target is farther after success, nearer after no progress."""
+        level = finished.variables["level"][:, 0]
+        distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
+        over = finished.time > self.episode_seconds - self.control_timestep / 2
+        whole = over | self.fallen(finished, LOWEST)
+        success = whole & self.success(finished)
+        self.averages.update(success=success[whole], level=level[whole])
         if not self.curriculum:
             return self.sample_initial_state(len(finished), generator)
-        level = finished.variables["level"][:, 0].clone()
-        distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
-        fallen = self.fallen(finished, LOWEST)
-        whole = fallen | (finished.time > self.episode_seconds - self.control_timestep / 2)
-        success = whole & (distance < SUCCESS_DISTANCE) & ~fallen
         failure = whole & ~success & (distance > 0.7 * start)
-        level = (level + success.double() - failure.double()).clamp(min=0.0)
-        anywhere = torch.randint(LAST_LEVEL + 1, level.shape, generator=generator).double()
-        level = torch.where(level > LAST_LEVEL, anywhere, level)
-        self._judge(success[whole], level)
+        level = next_level(level, success, failure, LAST_LEVEL, generator)
         return self._turned(self._start(level, generator, spread=0.5), generator)
-
-    def _judge(self, success: Tensor, level: Tensor) -> None:
-        if not len(success):
-            return
-        share = 1 - 0.998 ** len(success)  # an average over about the last 500 episodes
-        if math.isnan(self._success_rate):
-            self._success_rate, share = 0.0, 1.0
-        self._success_rate += share * (float(success.double().mean()) - self._success_rate)
-        self._mean_level += share * (float(level.mean()) - self._mean_level)
 
     def _turned(self, state: State, generator: torch.Generator | None) -> State:
         element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
@@ -211,13 +200,13 @@ class AnymalPush(Anymal):
         return (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
 
     def metrics(self) -> dict[str, float]:
-        """Success rate of about the last 500 training episodes and their mean level."""
-        return {"success": self._success_rate, "level": self._mean_level}
+        """Success rate and level, averaged over about the last 500 training episodes."""
+        return dict(self.averages.values)
 
     def state_dict(self) -> dict[str, Any]:
-        """The averages that :meth:`metrics` reports; levels are part of the state of the rows."""
-        return {"success_rate": self._success_rate, "mean_level": self._mean_level}
+        """The averages; levels are part of the state of the rows."""
+        return {"averages": dict(self.averages.values)}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self._success_rate, self._mean_level = saved["success_rate"], saved["mean_level"]
+        self.averages.values = dict(saved["averages"])

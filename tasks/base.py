@@ -118,7 +118,7 @@ class Task(abc.ABC):
                 f"expected a control_timestep that is a multiple of the model's timestep "
                 f"{self.model.opt.timestep} s, got {self.control_timestep} s; change one of the two"
             )
-        self.robot = derive(self.model, group, **({"carried": self.carried} if self.carried else {}))
+        self.robot = derive(self.model, group, carried=self.carried)
         parts = [entry.representation for entry in self.layout()]
         self.symmetry = Symmetry(
             group, {"observation": sum(parts[1:], parts[0]), "action": self.robot.actuators}
@@ -206,7 +206,7 @@ class Task(abc.ABC):
         return None
 
     def success(self, state: State) -> Tensor | None:
-        """Whether an episode that ends in ``state`` reached its goal, ``(n,)`` bool; None: no such notion."""
+        """Whether an episode that ends in ``state`` reached its goal, ``(n,)`` bool; None: undefined."""
         return None
 
     def transform_state(self, state: State, g: Element) -> State:

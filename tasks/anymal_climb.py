@@ -1,0 +1,288 @@
+"""ANYmal-Climb: be on top of a box, in front of or behind the robot, when the time is over.
+
+What counts is where the robot is in the last two seconds; how it gets there is its own affair. Such a
+sparse and delayed reward is not found by chance, so training goes through three phases (Rudin et al. 2022;
+the paper, Sec. IV): in A walking towards the target is rewarded, in B no longer, in C the robot starts with
+any heading. The bias of phase A is towards the target, not "forward", which would break the symmetry of
+front and back.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from tasks.anymal import Anymal, into_base, rotation
+from tasks.base import Entry, register
+from tasks.curriculum import Averages, next_level
+from tasks.state import State
+from torchrl_sym.representations import heading, height_map, invariant, polar
+
+BOX = 1.0  # half its edge, m; a cube sunk in the ground
+# Where the centre of the box is, m: ahead, and at most this far to the side.
+BOX_DISTANCE, BOX_OFFSET = (1.7, 2.0), 0.3
+TARGET_HEIGHT = 0.5  # of the target over the top of the box, m: the height of a standing robot
+# Height of the box, m: from the lowest to the task's own in LAST_LEVEL steps, each varied by a fifth.
+LOWEST_BOX, LAST_LEVEL = 0.05, 8
+# At the end of a successful episode the base is this near the target horizontally, and this far above the
+# top of the box; beyond the third distance the episode counts as failed, m.
+SUCCESS_DISTANCE, SUCCESS_HEIGHT, FAILURE_DISTANCE = 0.5, 0.3, 0.8
+TASK_SECONDS = 2.0  # the position is rewarded in this time at the end, s
+SPEED, STOP_DISTANCE = 0.8, 0.3  # asked for in phase A, m/s, until this near the target, m
+BASE_HEIGHT, LOWEST = 0.5, 0.2  # asked for over the ground, and counted as fallen, m
+FALL_PENALTY = 5.0
+# The grid of the height map: 21 x 11 points, 0.1 m apart, that turn with the robot's heading.
+ROWS, COLUMNS, SPACING = 21, 11, 0.1
+# A phase is over at this success rate and, for A, at this mean level.
+PHASE_SUCCESS, PHASE_LEVEL = 0.7, 3.0
+TASK_WEIGHTS = {"position": 10.0, "heading": 2.0}
+BIAS_WEIGHTS = {"velocity": 4.0}
+GAIT_WEIGHTS = {"alive": 0.5, "height": -10.0, "vertical": -0.5, "rolling": -0.05, "tilt": -0.5}
+HEADING_WEIGHTS = {"turned": -0.3}
+EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.005}
+Phase = Literal["A", "B", "C"]
+
+
+@register
+class AnymalClimb(Anymal):
+    """Climb a box in front of or behind the robot and stand on it at the end.
+
+    Group: Klein four. Observation: 45 proprioceptive numbers; target position, heading error (cos, sin) and
+    time left; 231 heights of the ground around the robot. The heading asked for is the one at the start.
+    An episode succeeds if the robot ends within 0.5 m of the box's centre, standing on it. Episodes have a
+    fixed length which is observed, so that reaching it ends them with no future value.
+
+    Args:
+        height: of the highest box, m.
+        phase: phase of training to start in.
+        curriculum: raise the box and go on to the next phase as climbing succeeds; if not, every episode
+            has a box of full height, and the phase stays.
+        **robot: arguments of :class:`~tasks.anymal.Anymal`.
+
+    Raises:
+        ValueError: no such phase, or a box lower than 5 cm.
+
+    Example:
+        >>> import torch
+        >>> task = AnymalClimb(height=0.2)
+        >>> start = task.sample_goal_state(2, torch.Generator().manual_seed(0))
+        >>> task.observe(start).shape
+        torch.Size([2, 282])
+    """
+
+    name = "anymal_climb"
+    asset = "anymal_climb.xml"
+    episode_seconds = 8.0
+    observation_size = 282
+    goal_names = ("front left", "back left", "front right", "back right")
+
+    def __init__(
+        self, *, height: float = 0.2, phase: Phase = "A", curriculum: bool = True, **robot: Any
+    ) -> None:
+        if phase not in ("A", "B", "C") or height < LOWEST_BOX:
+            raise ValueError(
+                f"expected phase 'A', 'B' or 'C' and a height of at least {LOWEST_BOX} m, got {phase!r} "
+                f"and {height}"
+            )
+        super().__init__(**robot)
+        self.height, self.phase, self.curriculum = height, phase, curriculum
+        self.averages = Averages("success", "level", "distance")
+        self._grid_x, self._grid_y = torch.cartesian_prod(*_axes()).unbind(-1)
+        self._below = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)  # the robot's footprint
+
+    def layout(self) -> tuple[Entry, ...]:
+        """Proprioception, command, height map."""
+        group = self.robot.group
+        return (
+            *self.proprioception(),
+            Entry("target position", polar(group), "m", "base", "polar vector"),
+            Entry("heading error (cos, sin)", heading(group), "1", "base", "sine changes sign in a mirror"),
+            Entry("time left", invariant(group, 1), "1", "-", "invariant"),
+            Entry(
+                "heights of the ground", height_map(group, *_axes()), "m", "heading",
+                "permutation of the grid's points", 2.0,
+            ),
+        )  # fmt: skip
+
+    def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
+        """A box of full height in front, on the left; any heading in phase C, else towards the box."""
+        level = torch.full((n,), float(LAST_LEVEL), dtype=torch.float64)
+        return self._start(level, generator, vary=0.0)
+
+    def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
+        """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
+        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        return self._turned(self._start(level, generator, vary=0.2 * self.curriculum), generator)
+
+    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+        """Judge whole episodes: higher boxes after success, lower ones after failure, the next phase."""
+        distance = self._distance(finished)
+        success, fallen = self.success(finished), self.fallen(finished, LOWEST)
+        whole = fallen | self._over(finished)
+        level = finished.variables["level"][:, 0]
+        self.averages.update(success=success[whole], level=level[whole], distance=distance[whole])
+        if not self.curriculum:
+            return self.sample_initial_state(len(finished), generator)
+        self._advance()
+        failure = whole & ~success & (fallen | (distance > FAILURE_DISTANCE))
+        level = next_level(level, whole & success, failure, LAST_LEVEL, generator)
+        return self._turned(self._start(level, generator, vary=0.2), generator)
+
+    def _advance(self) -> None:
+        values = self.averages.values
+        if self.phase != "C" and values["success"] > PHASE_SUCCESS and values["level"] > PHASE_LEVEL:
+            self.phase = "B" if self.phase == "A" else "C"
+            self.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
+
+    def _turned(self, state: State, generator: torch.Generator | None) -> State:
+        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
+        return self.transform_state(state, element)
+
+    def _start(self, level: Tensor, generator: torch.Generator | None, vary: float) -> State:
+        """Starts with the box in front, its centre on the left.
+
+        Args:
+            level: curriculum level of every row, ``(n,)``.
+            generator: source of the draws.
+            vary: boxes are up to this share lower than the level's.
+        """
+        n = len(level)
+        u = torch.rand(n, 4, generator=generator, dtype=torch.float64)
+        yaw = (2 * u[:, 0] - 1) * math.pi * (self.phase == "C")
+        state = self.standing(n, yaw, generator)
+        state.variables["level"] = level[:, None].clone()
+        height = LOWEST_BOX + (self.height - LOWEST_BOX) * level / LAST_LEVEL
+        height = height * (1 - vary * u[:, 3])
+        assert state.mocap_pos is not None and state.mocap_quat is not None
+        box, target = state.mocap_pos[:, 0], state.mocap_pos[:, 1]
+        box[:, 0] = BOX_DISTANCE[0] + (BOX_DISTANCE[1] - BOX_DISTANCE[0]) * u[:, 1]
+        box[:, 1] = BOX_OFFSET * u[:, 2]
+        box[:, 2] = height - BOX
+        target[:] = box
+        target[:, 2] = height + TARGET_HEIGHT
+        state.mocap_quat[:, 1] = state.qpos[:, 3:7]
+        return state
+
+    def ground(self, state: State, points: Tensor) -> Tensor:
+        """Height of the box where it is, else zero."""
+        assert state.mocap_pos is not None
+        box = state.mocap_pos[:, 0].to(points.dtype)
+        gap = (points[..., :2] - box[:, None, :2]).abs_()
+        return (gap <= BOX).all(dim=-1) * (box[:, None, 2] + BOX)
+
+    def heights(self, state: State) -> Tensor:
+        """Height of the ground at the points of the map, ``(n, 231)`` float32, m, in the world frame."""
+
+        def compute() -> Tensor:
+            assert state.mocap_pos is not None
+            ahead = self._ahead(state)
+            cos, sin = ahead.float().unsqueeze(-1).unbind(1)
+            box = state.mocap_pos[:, 0]
+            offset = (state.qpos[:, 0:2] - box[:, :2]).float()
+            x = torch.addcmul(offset[:, :1] - sin * self._grid_y, cos, self._grid_x).abs_()
+            y = torch.addcmul(offset[:, 1:] + cos * self._grid_y, sin, self._grid_x).abs_()
+            return (torch.maximum(x, y) <= BOX) * (box[:, 2:] + BOX).float()
+
+        return state.shared("heights", compute)
+
+    def _ahead(self, state: State) -> Tensor:
+        """Direction of the robot's heading, horizontal, ``(n, 2)``."""
+
+        def compute() -> Tensor:
+            forward = rotation(state)[:, :2, 0]
+            return forward / forward.norm(dim=-1, keepdim=True).clamp(min=1e-6)
+
+        return state.shared("ahead", compute)
+
+    def _heading_error(self, state: State) -> Tensor:
+        """(cos, sin) of the turn from the robot's heading to the one asked for, ``(n, 2)``."""
+        assert state.mocap_quat is not None
+        w, z = state.mocap_quat[:, 1, 0], state.mocap_quat[:, 1, 3]
+        cos, sin = w * w - z * z, 2 * w * z
+        x, y = self._ahead(state).unbind(-1)
+        return torch.stack([cos * x + sin * y, sin * x - cos * y], dim=-1)
+
+    def _gap(self, state: State) -> Tensor:
+        assert state.mocap_pos is not None
+        return state.mocap_pos[:, 1] - state.qpos[:, 0:3]
+
+    def _distance(self, state: State) -> Tensor:
+        """Horizontal distance of base and target, ``(n,)``, m."""
+        return self._gap(state)[:, :2].norm(dim=-1)
+
+    def _over(self, state: State) -> Tensor:
+        return state.time > self.episode_seconds - self.control_timestep / 2
+
+    def observe(self, state: State) -> Tensor:
+        """Proprioception, command, and the heights below a standing robot's base."""
+        observation = torch.empty(len(state), 282)
+        self.observe_robot(state, observation)
+        observation[:, 45:48] = into_base(rotation(state), self._gap(state))
+        observation[:, 48:50] = self._heading_error(state)
+        observation[:, 50] = 1 - state.time / self.episode_seconds
+        level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
+        observation[:, 51:] = (self.heights(state) - level).clamp_(-1.0, 1.0) * 2.0
+        return observation.clamp_(-20.0, 20.0)
+
+    def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Every term of the reward, weighted, per step; their sum is the reward."""
+        gap, velocity, turning = self._gap(state), state.qvel[:, 0:3], state.qvel[:, 3:6]
+        distance, turned = self._distance(state), 1 - self._heading_error(state)[:, 0]
+        last = (state.time > self.episode_seconds - TASK_SECONDS).double() / TASK_SECONDS
+        ground = self.heights(state)[:, self._below].mean(dim=1).double()
+        walking = distance > STOP_DISTANCE
+        asked = SPEED * gap[:, :2] / distance.clamp(min=1e-6)[:, None] * walking[:, None]
+        near = 1 / (1 + 4 * gap.square().sum(-1))
+        terms = {
+            "position": last * near,
+            "heading": last * near * (1 - 0.5 * turned),
+            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp() * (self.phase == "A"),
+            "alive": torch.ones_like(distance),
+            "height": (state.qpos[:, 2] - ground - BASE_HEIGHT).square(),
+            "vertical": velocity[:, 2].square(),
+            "rolling": turning[:, :2].square().sum(-1),
+            "tilt": rotation(state)[:, 2, :2].square().sum(-1),
+            "turned": turned,
+            **self.effort(state, action),
+        }
+        weights = TASK_WEIGHTS | BIAS_WEIGHTS | GAIT_WEIGHTS | HEADING_WEIGHTS | EFFORT_WEIGHTS
+        weighted = {name: weights[name] * self.control_timestep * x for name, x in terms.items()}
+        weighted["step"] = self.first_touch(state) * walking
+        weighted["fall"] = -FALL_PENALTY * self.fallen(state, LOWEST).double()
+        return weighted
+
+    def reward(self, state: State, action: Tensor) -> Tensor:
+        """Be on the box at the end; in phase A also walk towards it; walk well."""
+        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
+
+    def terminated(self, state: State) -> Tensor:
+        """The robot has fallen, or the time that it observes is over."""
+        return self.fallen(state, LOWEST) | self._over(state)
+
+    def success(self, state: State) -> Tensor:
+        """The robot stands on the box, near its centre."""
+        assert state.mocap_pos is not None
+        above = state.qpos[:, 2] - (state.mocap_pos[:, 0, 2] + BOX) > SUCCESS_HEIGHT
+        return above & (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
+
+    def metrics(self) -> dict[str, float]:
+        """Averages over about 500 training episodes, and the phase (0, 1, 2 for A, B, C)."""
+        return {**self.averages.values, "phase": float("ABC".index(self.phase))}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Phase and averages; levels are part of the state of the rows."""
+        return {"phase": self.phase, "averages": dict(self.averages.values)}
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.phase, self.averages.values = saved["phase"], dict(saved["averages"])
+
+
+def _axes() -> tuple[Tensor, Tensor]:
+    """Grid lines of the height map along and across the heading, m; exactly symmetric about zero."""
+    lines = (torch.arange(count, dtype=torch.float32) - count // 2 for count in (ROWS, COLUMNS))
+    x, y = (line * SPACING for line in lines)
+    return x, y
