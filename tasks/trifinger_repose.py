@@ -1,0 +1,366 @@
+"""Trifinger-Repose: three fingers bring a cube to a goal, wherever on the table or above it.
+
+The three fingers of TriFinger Pro are copies of one, turned by 120 degrees, and so are the task's three
+equivalent goals. The fingers are chiral: a turn is the only symmetry. Difficulties follow the Real Robot
+Challenge: a place on the table, a lift in the middle, a place in the air, place and orientation in the air.
+
+No term of the reward prefers a direction or a finger: all are norms, or sums over fingers. A cube does not
+look the same after a turn by 120 degrees and need not: the turn of the world carries it along
+(`torchrl_sym.mujoco.derive`), and with it the goal. The matrix that turns a quaternion by 120 degrees three
+times and gives back the same sign is that of the other sign of the turn, -q; so that turned starts are as
+likely as the starts themselves, both signs are drawn with equal chance.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from tasks.base import Edit, Entry, Task, register
+from tasks.curriculum import Averages
+from tasks.state import State
+from torchrl_sym import PointGroup, Representation
+from torchrl_sym.representations import polar, quaternion
+
+FINGERS = ("0", "1", "2")
+JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "lift", "knee"))
+# How far joints start from the model's reference pose, which observed positions are relative to, rad.
+START_NOISE = 0.1
+# Position control: targets around a pose, rad, and gains, N m/rad and N m s/rad.
+TARGET_POSE, TARGET_RANGE = (0.0, 0.9, -1.7), (0.5, 0.6, 0.8)
+STIFFNESS, TARGET_DAMPING = (4.0, 4.0, 2.0), (0.15, 0.15, 0.075)
+# What observations are multiplied by: a fingertip's m and rad/s are far from 1.
+JOINT_VELOCITY_SCALE, POSITION_SCALE = 0.1, 10.0
+OBSERVATION_LIMIT = 20.0
+CUBE = 0.0325  # half its edge, m
+CUBE_DIAGONAL = math.sqrt(3) * CUBE
+ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
+# Difficulty 1 uses the inner part of the arena by default, m.
+INNER_ARENA = 0.07
+LIFT, HIGHEST = 0.0825, 0.1  # goal of difficulty 2 and highest goal of 3 and 4, m
+# Success: position error, m, at difficulty 1 and above, and orientation error, rad, at difficulty 4.
+PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
+# The cube has left the arena, m: beyond the upper edge of the wall.
+OUTSIDE = 0.30
+# Per metre: the kernel 1 / (e^x + 2 + e^-x) of a keypoint 3 cm off is 0.8 of its maximum.
+KERNEL = 30.0
+# Weights, per step. The first three are those of IsaacGymEnvs divided by 100; speed costs a tenth of theirs.
+WEIGHTS = {"keypoints": 0.4, "approach": 2.5, "speed": -5e-4, "torque": -5e-4, "action_rate": -5e-4}
+# Kinematics of a finger, m: offset of the tip from the swing axis, lift axis along it, links, height.
+_SIDE, _AXIS, _LINK, _HEIGHT = 0.086, 0.0505, 0.16, 0.29
+
+
+@register
+class TrifingerRepose(Task):
+    """Bring a cube of 65 mm and 80 g to a goal with nine torques.
+
+    Group: turns by 120 degrees. Action: torques, in units of 0.36 N m, less a safety damping that the
+    platform adds. Observation: joint positions and velocities, cube pose, goal pose, last action. Where the
+    goal has no orientation (difficulty 1 to 3), its quaternion is observed as zeros: they are invariant, as
+    no constant orientation is, and say nothing that a policy would have to learn to ignore.
+
+    Args:
+        difficulty: 1, a place on the table; 2, 82.5 mm above the middle; 3, a place up to 0.1 m high;
+            4, the same with an orientation.
+        radius: of the disc of start and goal positions, m. Defaults to 0.07 at difficulty 1, else 0.1387.
+        control: ``"torque"``, or ``"position"``: targets of a joint servo within the same torques.
+        episode_seconds: length of an episode, s; None for 5 s at difficulty 1, else 15 s.
+        physics_timestep: 0.005 s; 0.01 s simulates faster and was good enough to train in.
+        cube_mass: range of the cube's mass, kg, drawn per episode; None keeps 0.08.
+        friction: range of a factor on all sliding friction, drawn per episode; None keeps the model's.
+        weak_finger: number of a finger (0, 1, 2) of half the strength, for studies of asymmetry.
+
+    Raises:
+        ValueError: an argument outside its range.
+
+    Example:
+        >>> import torch
+        >>> task = TrifingerRepose(difficulty=4)
+        >>> start = task.sample_goal_state(2, torch.Generator().manual_seed(0))
+        >>> task.observe(start).shape
+        torch.Size([2, 41])
+    """
+
+    name = "trifinger_repose"
+    asset = "trifinger_repose.xml"
+    control_timestep = 0.02
+    observation_size = 41
+    action_size = 9
+    goal_names = ("right", "back left", "front left")
+    carried = ("cube", "goal")
+    max_velocity = 200.0
+
+    def __init__(
+        self,
+        *,
+        difficulty: int = 1,
+        radius: float | None = None,
+        control: str = "torque",
+        episode_seconds: float | None = None,
+        physics_timestep: float = 0.005,
+        cube_mass: tuple[float, float] | None = None,
+        friction: tuple[float, float] | None = None,
+        weak_finger: int | None = None,
+    ) -> None:
+        radius = radius if radius is not None else (INNER_ARENA if difficulty == 1 else ARENA)
+        if difficulty not in (1, 2, 3, 4) or control not in ("torque", "position"):
+            raise ValueError(
+                "expected a difficulty of 1, 2, 3 or 4 and control 'torque' or 'position', got "
+                f"{difficulty!r} and {control!r}"
+            )
+        if not 0 < radius <= ARENA or weak_finger not in (None, 0, 1, 2):
+            raise ValueError(
+                f"expected a radius in (0, {ARENA}] m and a weak_finger among 0, 1, 2 or None, got "
+                f"{radius} and {weak_finger!r}"
+            )
+        for what, span in {"cube_mass": cube_mass, "friction": friction}.items():
+            if span is not None and not 0 < span[0] <= span[1]:
+                raise ValueError(f"{what}: expected a rising, positive range, got {span}")
+        self.difficulty, self.radius, self.position_control = difficulty, radius, control == "position"
+        self.episode_seconds = 5.0 if difficulty == 1 else 15.0
+        edit = _edit(physics_timestep, self.position_control, weak_finger)
+        super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
+        self.cube_mass, self.friction = cube_mass, friction
+        self._start_pose = torch.from_numpy(self.model.qpos0[:9].copy())
+        self._torque = float(self.model.actuator_ctrlrange[0, 1])  # the same for all
+        self._target_pose, self._target_range = _by_joint(TARGET_POSE), _by_joint(TARGET_RANGE)
+        turns = -torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
+        self._turn = torch.stack([turns.cos(), turns.sin()])
+        signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
+        self._corners = torch.cartesian_prod(signs, signs, signs)
+        self.averages = Averages("success", "error")
+
+    def layout(self) -> tuple[Entry, ...]:
+        """Joints, cube, goal, last action."""
+        group, robot = self.robot.group, self.robot
+        joints, position, orientation = robot.joints(JOINTS), polar(group), quaternion(group)
+        by_finger, lift = "permutation of the fingers", "quaternion, multiplied from the left"
+        speed = JOINT_VELOCITY_SCALE
+        return (
+            Entry("joint positions from the starting pose", joints, "rad", "joints", by_finger),
+            Entry("joint velocities", joints, "rad/s", "joints", by_finger, speed),
+            Entry("cube position", position, "m", "world", "polar vector", POSITION_SCALE),
+            Entry("cube orientation", orientation, "1", "world", lift),
+            Entry("goal position", position, "m", "world", "polar vector", POSITION_SCALE),
+            Entry("goal orientation, zeros if it has none", orientation, "1", "world", lift),
+            Entry("last action", robot.actuators, "0.36 N m", "joints", by_finger),
+        )
+
+    def variables(self) -> dict[str, Representation]:
+        """Last action, and distance of every fingertip from the cube one step ago, m."""
+        tips = self.robot.joints([f"knee{finger}" for finger in FINGERS]).absolute()
+        return {"last_action": self.robot.actuators, "tip_distance": tips}
+
+    def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
+        """The goal is on the right, give or take 60 degrees; at difficulty 2, with a central goal, the cube."""
+        u = torch.rand(n, 17, generator=generator, dtype=torch.float64)
+        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
+        qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
+        anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)
+        qpos[:, 9:11] = self._place(right if self.difficulty == 2 else anywhere, u[:, 11])
+        qpos[:, 11] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        half = u[:, 12] * (2 * math.pi)  # half the yaw: over a whole turn, both signs of the quaternion
+        qpos[:, 12], qpos[:, 15] = half.cos(), half.sin()
+        goal = torch.zeros(n, 1, 3, dtype=torch.float64)
+        goal[:, 0, 2] = self._height(u[:, 14])
+        if self.difficulty != 2:
+            goal[:, 0, :2] = self._place(right, u[:, 13])
+        orientation = qpos[:, 12:16].clone()  # shown where the goal has none
+        if self.difficulty == 4:
+            drawn = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+            orientation = drawn / drawn.norm(dim=-1, keepdim=True)
+        state = State(
+            qpos=qpos,
+            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
+            mocap_pos=goal,
+            mocap_quat=orientation[:, None],
+            variables={"last_action": torch.zeros(n, 9, dtype=torch.float64)},
+        )
+        state.variables["tip_distance"] = self.tip_distance(state)
+        return state
+
+    def _place(self, bearing: Tensor, u: Tensor) -> Tensor:
+        """Uniform over the disc, or a sector of it, ``(n, 2)``."""
+        return (self.radius * u.sqrt())[:, None] * torch.stack([bearing.cos(), bearing.sin()], dim=-1)
+
+    def _height(self, u: Tensor) -> Tensor:
+        if self.difficulty <= 2:
+            return torch.full_like(u, CUBE if self.difficulty == 1 else LIFT)
+        lowest = CUBE if self.difficulty == 3 else CUBE_DIAGONAL
+        return lowest + (HIGHEST - lowest) * u
+
+    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+        """Record how whole episodes ended."""
+        whole = finished.time > self.episode_seconds - self.control_timestep / 2
+        whole |= self.terminated(finished)
+        success, error = self.success(finished), self.position_error(finished)
+        self.averages.update(success=success[whole], error=error[whole])
+        return self.sample_initial_state(len(finished), generator)
+
+    def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
+        """Mass of the cube and friction; scalars, hence invariant under the group."""
+        if self.friction is not None:
+            low, high = self.friction
+            factor = low + (high - low) * torch.rand(len(ids), 1, generator=generator, dtype=torch.float64)
+            nominal = torch.from_numpy(self.model.geom_friction[:, 0].copy())
+            simulation.expand("geom_friction")[ids, :, 0] = nominal * factor
+        if self.cube_mass is not None:
+            low, high = self.cube_mass
+            mass = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
+            cube = self.model.body("cube").id
+            inertia = torch.from_numpy(self.model.body_inertia[cube] / self.model.body_mass[cube])
+            simulation.expand("body_mass")[ids, cube] = mass
+            simulation.expand("body_inertia")[ids, cube] = mass[:, None] * inertia
+            simulation.refresh(ids)
+
+    def control(self, action: Tensor, state: State) -> Tensor:
+        """Torques, N m; or joint targets, rad."""
+        action = action.double().clamp(-1.0, 1.0)
+        return (
+            self._target_pose + self._target_range * action
+            if self.position_control
+            else self._torque * action
+        )
+
+    def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Remember the action and the distances of the fingertips."""
+        return {"last_action": action.double().clamp(-1.0, 1.0), "tip_distance": self.tip_distance(state)}
+
+    def observe(self, state: State) -> Tensor:
+        """Joints, cube, goal, last action."""
+        assert state.mocap_pos is not None and state.mocap_quat is not None
+        observation = torch.zeros(len(state), 41)
+        observation[:, 0:9] = state.qpos[:, :9] - self._start_pose
+        observation[:, 9:18] = state.qvel[:, :9] * JOINT_VELOCITY_SCALE
+        observation[:, 18:21] = state.qpos[:, 9:12] * POSITION_SCALE
+        observation[:, 21:25] = state.qpos[:, 12:16]
+        observation[:, 25:28] = state.mocap_pos[:, 0] * POSITION_SCALE
+        if self.difficulty == 4:
+            observation[:, 28:32] = state.mocap_quat[:, 0]
+        observation[:, 32:41] = state.variables["last_action"]
+        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+
+    def fingertips(self, state: State) -> tuple[Tensor, Tensor]:
+        """Centres of the fingertips, ``(n, 3, 3)``, m, and squares of their speeds, ``(n, 3)``, m^2/s^2.
+
+        Closed form: derived fields of the simulator lag by one physics step.
+        """
+        q0, q1, q2 = state.qpos[:, :9].unflatten(-1, (3, 3)).unbind(-1)
+        w0, w1, w2 = state.qvel[:, :9].unflatten(-1, (3, 3)).unbind(-1)
+        q12, w12 = q1 + q2, w1 + w2
+        sin1, cos1, sin12, cos12 = q1.sin(), q1.cos(), q12.sin(), q12.cos()
+        along = _AXIS + _LINK * (sin1 + sin12)  # the swing axis
+        down = -_LINK * (cos1 + cos12)
+        sin0, cos0 = q0.sin(), q0.cos()
+        across, height = _SIDE * cos0 + down * sin0, _HEIGHT - _SIDE * sin0 + down * cos0
+        cos, sin = self._turn
+        tips = torch.stack([across * cos - along * sin, across * sin + along * cos, height], dim=-1)
+        speed_along = _LINK * (cos1 * w1 + cos12 * w12)
+        speed_down = _LINK * (sin1 * w1 + sin12 * w12)
+        # In the plane that swings: the tip turns about the axis and moves down.
+        square = speed_along.square() + (down * w0).square() + (speed_down - _SIDE * w0).square()
+        return tips, square
+
+    def tip_distance(self, state: State) -> Tensor:
+        """Distance of every fingertip from the cube's centre, ``(n, 3)``, m."""
+
+        def compute() -> Tensor:
+            return (self.fingertips(state)[0] - state.qpos[:, None, 9:12]).norm(dim=-1)
+
+        return state.shared("tip_distance", compute)
+
+    def position_error(self, state: State) -> Tensor:
+        """Distance of the cube from its goal, ``(n,)``, m."""
+        assert state.mocap_pos is not None
+        goal = state.mocap_pos[:, 0]
+        return state.shared("position_error", lambda: (state.qpos[:, 9:12] - goal).norm(dim=-1))
+
+    def orientation_error(self, state: State) -> Tensor:
+        """Angle between cube and goal, ``(n,)``, rad; the same for both signs of a quaternion."""
+        assert state.mocap_quat is not None
+        product = (state.qpos[:, 12:16] * state.mocap_quat[:, 0]).sum(dim=-1).abs()
+        return 2 * product.clamp(max=1.0).acos()
+
+    def _keypoint_distance(self, state: State) -> Tensor:
+        """Distance of the cube's corners from the goal's, ``(n, 8)``, m; or of the centres, ``(n, 1)``."""
+        if self.difficulty < 4:  # without an orientation, all corners are off by the same
+            return self.position_error(state)[:, None]
+        assert state.mocap_pos is not None and state.mocap_quat is not None
+        turn = _matrix(state.qpos[:, 12:16]) - _matrix(state.mocap_quat[:, 0])
+        offset = state.qpos[:, 9:12] - state.mocap_pos[:, 0]
+        return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
+
+    def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Every term of the reward, weighted, per step; their sum is the reward."""
+        far = KERNEL * self._keypoint_distance(state)
+        closer = state.variables["tip_distance"] - self.tip_distance(state)
+        action = action.double().clamp(-1.0, 1.0)
+        terms = {
+            "keypoints": (1 / (far.exp() + 2 + (-far).exp())).mean(dim=-1),
+            "approach": closer.sum(dim=-1),
+            "speed": self.fingertips(state)[1].sum(dim=-1),
+            "torque": action.square().sum(dim=-1),
+            "action_rate": (action - state.variables["last_action"]).square().sum(dim=-1),
+        }
+        return {name: WEIGHTS[name] * term for name, term in terms.items()}
+
+    def reward(self, state: State, action: Tensor) -> Tensor:
+        """Bring the corners to their goals, the fingertips to the cube, gently."""
+        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
+
+    def terminated(self, state: State) -> Tensor:
+        """The cube is outside the arena: over the wall, or thrown up."""
+        x, y, z = state.qpos[:, 9:12].unbind(-1)
+        return (x.square() + y.square() > OUTSIDE**2) | (z.abs() > OUTSIDE)
+
+    def success(self, state: State) -> Tensor:
+        """Within 3 cm of the goal at difficulty 1, else within 2 cm; at difficulty 4 and 0.4 rad."""
+        limit = PLANAR_DISTANCE if self.difficulty == 1 else SUCCESS_DISTANCE
+        close = self.position_error(state) < limit
+        return close & (self.orientation_error(state) < SUCCESS_ANGLE) if self.difficulty == 4 else close
+
+    def metrics(self) -> dict[str, float]:
+        """Success rate and mean final position error (m) of about the last 500 training episodes."""
+        return dict(self.averages.values)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The averages that :meth:`metrics` reports."""
+        return dict(self.averages.values)
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Continue from :meth:`state_dict`."""
+        self.averages.values = dict(saved)
+
+
+def _by_joint(finger: tuple[float, ...]) -> Tensor:
+    return torch.tensor(finger * 3, dtype=torch.float64)
+
+
+def _matrix(quaternion: Tensor) -> Tensor:
+    """Rotation matrices, ``(n, 3, 3)``, of unit quaternions (w, x, y, z)."""
+    w, x, y, z = quaternion.unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+
+
+def _edit(timestep: float, position_control: bool, weak_finger: int | None) -> Edit:
+    def edit(spec) -> None:
+        spec.option.timestep = timestep
+        for index, joint in enumerate(JOINTS):
+            actuator, kind = spec.actuator(joint), index % 3
+            if position_control:
+                low, high = TARGET_POSE[kind] - TARGET_RANGE[kind], TARGET_POSE[kind] + TARGET_RANGE[kind]
+                actuator.ctrlrange = [low, high]
+                actuator.gainprm[0] = STIFFNESS[kind]
+                actuator.biasprm[1:3] = [-STIFFNESS[kind], -TARGET_DAMPING[kind]]
+            if weak_finger is not None and joint.endswith(str(weak_finger)):
+                actuator.forcerange = actuator.forcerange / 2
+
+    return edit
