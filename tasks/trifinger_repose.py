@@ -6,9 +6,8 @@ Challenge: a place on the table, a lift in the middle, a place in the air, place
 
 No term of the reward prefers a direction or a finger: all are norms, or sums over fingers. A cube does not
 look the same after a turn by 120 degrees and need not: the turn of the world carries it along
-(`torchrl_sym.mujoco.derive`), and with it the goal. The matrix that turns a quaternion by 120 degrees three
-times and gives back the same sign is that of the other sign of the turn, -q; so that turned starts are as
-likely as the starts themselves, both signs are drawn with equal chance.
+(`torchrl_sym.mujoco.derive`), and with it the goal. Its quaternion changes sign on the way, or three turns
+would not add up to none; starts draw both signs with equal chance, so that turned starts are as likely.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
 OUTSIDE = 0.30
 # Per metre: the kernel 1 / (e^x + 2 + e^-x) of a keypoint 3 cm off is 0.8 of its maximum.
 KERNEL = 30.0
-# Weights, per step. The first three are those of IsaacGymEnvs divided by 100; speed costs a tenth of theirs.
+# Weights, per step. The first two are a hundredth of IsaacGymEnvs', the price of speed a thousandth.
 WEIGHTS = {"keypoints": 0.4, "approach": 2.5, "speed": -5e-4, "torque": -5e-4, "action_rate": -5e-4}
 # Kinematics of a finger, m: offset of the tip from the swing axis, lift axis along it, links, height.
 _SIDE, _AXIS, _LINK, _HEIGHT = 0.086, 0.0505, 0.16, 0.29
@@ -155,7 +154,7 @@ class TrifingerRepose(Task):
         return {"last_action": self.robot.actuators, "tip_distance": tips}
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
-        """The goal is on the right, give or take 60 degrees; at difficulty 2, with a central goal, the cube."""
+        """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
         u = torch.rand(n, 17, generator=generator, dtype=torch.float64)
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
@@ -219,11 +218,9 @@ class TrifingerRepose(Task):
     def control(self, action: Tensor, state: State) -> Tensor:
         """Torques, N m; or joint targets, rad."""
         action = action.double().clamp(-1.0, 1.0)
-        return (
-            self._target_pose + self._target_range * action
-            if self.position_control
-            else self._torque * action
-        )
+        if self.position_control:
+            return self._target_pose + self._target_range * action
+        return self._torque * action
 
     def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Remember the action and the distances of the fingertips."""
