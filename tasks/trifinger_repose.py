@@ -37,8 +37,6 @@ OBSERVATION_LIMIT = 20.0
 CUBE = 0.0325  # half its edge, m
 CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
-# Difficulty 1 uses the inner part of the arena by default, m.
-INNER_ARENA = 0.07
 LIFT, HIGHEST = 0.0825, 0.1  # goal of difficulty 2 and highest goal of 3 and 4, m
 # Success: position error, m, at difficulty 1 and above, and orientation error, rad, at difficulty 4.
 PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
@@ -64,7 +62,7 @@ class TrifingerRepose(Task):
     Args:
         difficulty: 1, a place on the table; 2, 82.5 mm above the middle; 3, a place up to 0.1 m high;
             4, the same with an orientation.
-        radius: of the disc of start and goal positions, m. Defaults to 0.07 at difficulty 1, else 0.1387.
+        radius: of the disc of start and goal positions, m; at most and by default 0.1387.
         control: ``"torque"``, or ``"position"``: targets of a joint servo within the same torques.
         episode_seconds: length of an episode, s; None for 5 s at difficulty 1, else 15 s.
         physics_timestep: 0.005 s; 0.01 s simulates faster and was good enough to train in.
@@ -96,7 +94,7 @@ class TrifingerRepose(Task):
         self,
         *,
         difficulty: int = 1,
-        radius: float | None = None,
+        radius: float = ARENA,
         control: str = "torque",
         episode_seconds: float | None = None,
         physics_timestep: float = 0.005,
@@ -104,7 +102,6 @@ class TrifingerRepose(Task):
         friction: tuple[float, float] | None = None,
         weak_finger: int | None = None,
     ) -> None:
-        radius = radius if radius is not None else (INNER_ARENA if difficulty == 1 else ARENA)
         if difficulty not in (1, 2, 3, 4) or control not in ("torque", "position"):
             raise ValueError(
                 "expected a difficulty of 1, 2, 3 or 4 and control 'torque' or 'position', got "
