@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parents[1]
 TINY = ["--config.iterations", "2", "--config.num-envs", "8", "--config.horizon", "8"]
@@ -55,6 +56,10 @@ def test_train_and_continue(tmp_path):
     assert re.search(r"mean return -\d", first)
     run("examples/train.py", "--folder", tmp_path, *TINY[2:], "--config.iterations", "3")
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 4
+    film = tmp_path / "policy.gif"
+    watch = ["--checkpoint", tmp_path, "--stochastic", "--seconds", "0.1", "--width", "64", "--out", film]
+    run("examples/watch.py", "cartpole", *watch)
+    assert film.exists()
 
 
 def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
@@ -62,6 +67,23 @@ def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     settings = ["--seeds", "1", "--iterations", "2", "--episodes", "4", "--workers", "2"]
     output = run("examples/quickstart.py", *settings, "--folder", tmp_path, "--picture", picture)
     assert "| PPO + augmentation | mean |" in output
+    assert picture.stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("suffix", ["png", "gif"])
+def test_watch_draws_every_goal(tmp_path, suffix):
+    picture = tmp_path / f"watch.{suffix}"
+    settings = ["--seconds", "0.1", "--width", "64", "--frames", "2", "--out", picture]
+    assert "right, left" in run("examples/watch.py", "cartpole", *settings)
+    with Image.open(picture) as image:
+        assert image.size == ((128, 96) if suffix == "png" else (128, 48))
+        assert getattr(image, "n_frames", 1) == (1 if suffix == "png" else 3)
+
+
+def test_watch_draws_paths_from_above(tmp_path):
+    picture = tmp_path / "paths.png"
+    settings = ["--goals", "front left", "hind right", "--seconds", "0.1", "--overlay", "--out", picture]
+    assert "front left, hind right" in run("examples/watch.py", "anymal_push", *settings)
     assert picture.stat().st_size > 10_000
 
 

@@ -1,0 +1,312 @@
+"""Pictures and films of states, without a display: record a rollout, render it, put goals side by side.
+
+A task is evaluated on equivalent goals, and symmetry is easiest to judge by eye: start every goal from
+the mirrored state and watch them next to each other, or draw all paths from above and map them back
+onto one goal, where a symmetric policy leaves a single path.
+
+MuJoCo chooses its OpenGL when it is imported: on a machine without a display, set the environment
+variable ``MUJOCO_GL`` to ``egl`` (or ``osmesa``) before Python starts, as examples/watch.py does.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+from tensordict import TensorDictBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+
+from tasks.base import Task
+from tasks.environment import BatchedEnv
+from tasks.state import State
+
+mj: Any = mujoco  # its compiled modules have no type stubs
+COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown")
+
+
+def record(
+    env: BatchedEnv,
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    start: State,
+    *,
+    steps: int | None = None,
+    exploration: ExplorationType = ExplorationType.DETERMINISTIC,  # pyright: ignore[reportArgumentType]
+) -> list[State]:
+    """All states of a rollout from given starts.
+
+    Nothing is reset: a robot that has fallen stays on the ground while the other rows go on.
+
+    Args:
+        env: as many simulations as ``start`` has rows.
+        policy: writes ``"action"`` from ``"observation"``. Runs without gradients.
+        start: first state of every row.
+        steps: control steps; None for one episode.
+        exploration: ``ExplorationType.RANDOM`` samples the actions, from torch's global generator.
+
+    Returns:
+        ``steps + 1`` states, ``start`` first.
+
+    Example:
+        >>> import tasks, torch
+        >>> env = tasks.make_env("cartpole", num_envs=2, num_threads=1)
+        >>> start = env.task.sample_goal_state(2, torch.Generator().manual_seed(0))
+        >>> len(record(env, env.rand_action, start, steps=5))
+        6
+    """
+    tensordict: TensorDictBase = env.reset_to(start)
+    states = [env.state]
+    with torch.no_grad(), set_exploration_type(exploration):
+        for _ in range(env.task.max_steps if steps is None else steps):
+            tensordict = step_mdp(env.step(policy(tensordict)))
+            states.append(env.state)
+    return states
+
+
+def render(
+    task: Task,
+    states: Sequence[State],
+    *,
+    camera: str | None = None,
+    width: int = 320,
+    height: int = 240,
+) -> list[np.ndarray]:
+    """Images of states, headless.
+
+    Args:
+        task: whose model is drawn.
+        states: n rows each, such as :func:`record` returns.
+        camera: its name; None for ``"overview"``, or the model's first camera, or a free one.
+        width: of one image, pixels; at most ``offwidth`` of the model.
+        height: of one image, pixels; at most ``offheight`` of the model.
+
+    Returns:
+        For each state ``(n, height, width, 3)`` uint8.
+
+    Raises:
+        RuntimeError: no OpenGL.
+        KeyError: no such camera.
+        ValueError: larger than the model's frame buffer.
+
+    Example:
+        >>> from tasks.base import create
+        >>> task = create("cartpole")
+        >>> start = task.sample_goal_state(2, None)
+        >>> render(task, [start], width=64, height=48)[0].shape
+        (2, 48, 64, 3)
+    """
+    model = copy.copy(task.model)
+    model.vis.map.shadowclip = 1.5  # see _aim_lights
+    names = [model.camera(i).name for i in range(model.ncam)]
+    if camera is None:
+        camera = "overview" if "overview" in names or not names else names[0]
+    elif camera not in names:
+        raise KeyError(f"expected one of the cameras {names}, got {camera!r}")
+    data = mj.MjData(model)
+    renderer = _renderer(model, height, width)
+    try:
+        images = []
+        for state in states:
+            rows = np.empty((len(state), height, width, 3), dtype=np.uint8)
+            for row in range(len(state)):
+                _pose(model, data, state, row)
+                renderer.update_scene(data, camera if names else -1)
+                _aim_lights(model, renderer.scene)
+                rows[row] = renderer.render()
+            images.append(rows)
+    finally:
+        renderer.close()
+    return images
+
+
+def _renderer(model: Any, height: int, width: int) -> Any:
+    try:
+        return mj.Renderer(model, height, width)
+    except ValueError:
+        raise
+    except Exception as error:  # every OpenGL backend has exceptions of its own
+        raise RuntimeError(
+            f"expected OpenGL for off-screen rendering, got {type(error).__name__} with MUJOCO_GL="
+            f"{os.environ.get('MUJOCO_GL', '')!r}; set MUJOCO_GL=egl (or osmesa) before Python starts"
+        ) from error
+
+
+def _pose(model: Any, data: Any, state: State, row: int) -> None:
+    mj.mj_resetData(model, data)  # mocap bodies that the state leaves out are where the model has them
+    data.qpos[:], data.qvel[:] = state.qpos[row].numpy(), state.qvel[row].numpy()
+    if state.mocap_pos is not None:
+        data.mocap_pos[:] = state.mocap_pos[row].numpy()
+    if state.mocap_quat is not None:
+        data.mocap_quat[:] = state.mocap_quat[row].numpy()
+    data.time = float(state.time[row])
+    mj.mj_forward(model, data)
+
+
+def _aim_lights(model: Any, scene: Any) -> None:
+    """Move directional lights so that they shine through the middle of the scene.
+
+    Their shadows cover only what is around that line; what is at the border is drawn speckled.
+    """
+    for light in scene.lights[: scene.nlight]:
+        if light.type == mj.mjtLightType.mjLIGHT_DIRECTIONAL and not light.headlight:
+            light.pos = model.stat.center - 2 * model.stat.extent * np.asarray(light.dir)
+
+
+def sheet(rows: Sequence[Sequence[np.ndarray]], captions: Sequence[Sequence[str]]) -> np.ndarray:
+    """Images of one size in rows and columns, each with its caption in the upper left corner.
+
+    Args:
+        rows: ``(height, width, 3)`` uint8 each; rows may have different lengths.
+        captions: one for each image.
+
+    Returns:
+        One image, uint8; places without an image are white.
+
+    Example:
+        >>> import numpy as np
+        >>> image = np.zeros((20, 30, 3), dtype=np.uint8)
+        >>> sheet([[image, image], [image]], [["right", "left"], [""]]).shape
+        (40, 60, 3)
+    """
+    height, width = rows[0][0].shape[:2]
+    picture = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "white")
+    draw = ImageDraw.Draw(picture)
+    font = ImageFont.load_default(max(10, height // 15))
+    for i, (images, texts) in enumerate(zip(rows, captions, strict=True)):
+        for j, (image, text) in enumerate(zip(images, texts, strict=True)):
+            corner = (j * width, i * height)
+            picture.paste(Image.fromarray(image), corner)
+            place = (corner[0] + height // 30, corner[1] + height // 40)
+            draw.text(place, text, fill="#202020", font=font, stroke_width=2, stroke_fill="white")
+    return np.asarray(picture)
+
+
+def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.0) -> None:
+    """Write a picture or a film; the suffix decides.
+
+    Args:
+        path: ``.png`` (one frame), ``.gif``, or ``.mp4`` (needs imageio and imageio-ffmpeg).
+        frames: ``(height, width, 3)`` uint8 each.
+        fps: frames per second.
+
+    Raises:
+        ValueError: another suffix, or not one frame for a png.
+        ImportError: mp4 without imageio-ffmpeg.
+
+    Example:
+        >>> import numpy as np, tempfile
+        >>> image = np.zeros((20, 30, 3), dtype=np.uint8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     save(f"{folder}/film.gif", [image, image])
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix == ".png":
+        if len(frames) != 1:
+            raise ValueError(
+                f"expected one frame for a png, got {len(frames)}; write a gif, or use sheet()"
+            )
+        # A palette of 256 colours is a third of the size, and simple scenes look the same.
+        Image.fromarray(frames[0]).quantize(256).save(path, optimize=True)
+    elif path.suffix == ".gif":
+        images = [Image.fromarray(frame).quantize(128) for frame in frames]
+        images[0].save(path, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+    elif path.suffix == ".mp4":
+        _save_mp4(path, frames, fps)
+    else:
+        raise ValueError(f"expected a file name that ends in .png, .gif or .mp4, got {path.name!r}")
+
+
+def _save_mp4(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
+    try:
+        import imageio
+        import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            f"expected imageio and imageio-ffmpeg to write {path.name}, got {error}; "
+            "pip install imageio imageio-ffmpeg, or write a .gif"
+        ) from error
+    even = [frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # h264 wants it
+    imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # type: ignore[arg-type]
+
+
+def overlay(task: Task, states: Sequence[State], elements: Sequence[int]) -> Figure:
+    """Paths of everything that moves freely, from above: as they were, and mapped back onto one goal.
+
+    On the right, the path of goal g is mapped by the inverse of g. Started from the images of one state,
+    a symmetric policy leaves a single path there; a policy that turns its robot round first, or prefers
+    some of its limbs, does not.
+
+    Args:
+        task: the task.
+        states: a rollout of one row per goal, such as :func:`record` returns.
+        elements: group element of each row.
+
+    Returns:
+        The figure; arrows show headings, squares targets.
+
+    Raises:
+        ValueError: nothing in the model has a free joint.
+
+    Example:
+        >>> from tasks.base import create
+        >>> task = create("anymal_push")
+        >>> states = [task.transform_state(task.sample_goal_state(1, None), 1)] * 2
+        >>> len(overlay(task, states, [1]).axes)
+        2
+    """
+    model, group = task.model, task.symmetry.group
+    free = [j for j in range(model.njnt) if model.jnt_type[j] == mj.mjtJoint.mjJNT_FREE]
+    if not free:
+        raise ValueError(
+            f"expected a task in which something moves freely, got {task.name!r}, whose joints are all "
+            "attached; watch it as a film instead"
+        )
+    figure = Figure(figsize=(10, 5), layout="constrained")
+    panels = figure.subplots(1, 2)
+    back = group.inverse[torch.as_tensor(elements)]
+    for axes, title in zip(panels, ("as run", f"mapped back onto {task.goal_names[0]}"), strict=True):
+        for number, joint in enumerate(free):
+            at = model.jnt_qposadr[joint]
+            path = torch.stack([state.qpos[:, at : at + 7] for state in states]).numpy()
+            _draw_paths(
+                axes, path, elements, task, body=model.body(model.jnt_bodyid[joint]).name, style=number
+            )
+        last = states[-1].mocap_pos
+        if last is not None:
+            for row, g in enumerate(elements):
+                axes.plot(*last[row, :, :2].numpy().T, "s", color=_color(g), markersize=9, alpha=0.4)
+        axes.set(title=title, xlabel="x [m]", aspect="equal")
+        axes.grid(alpha=0.3)
+        states = [task.transform_state(state, back) for state in states]
+    panels[0].set_ylabel("y [m]")
+    figure.legend(
+        *panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
+    )
+    return figure
+
+
+def _draw_paths(
+    axes: Any, path: np.ndarray, elements: Sequence[int], task: Task, body: str, style: int
+) -> None:
+    """Paths ``(steps, goals, 7)`` of one free body, with an arrow for its heading every half second."""
+    stride = max(1, round(0.5 / task.control_timestep))
+    for row, g in enumerate(elements):
+        x, y = path[:, row, 0], path[:, row, 1]
+        label = f"{task.goal_names[g]}, {body}"
+        axes.plot(x, y, ("-", "--", ":")[style % 3], color=_color(g), label=label)
+        axes.plot(x[0], y[0], "o", color=_color(g), markersize=4)
+        w, qx, qy, qz = path[::stride, row, 3:7].T
+        ahead = 1 - 2 * (qy**2 + qz**2), 2 * (qx * qy + w * qz)
+        axes.quiver(x[::stride], y[::stride], *ahead, color=_color(g), width=0.004, scale=18, alpha=0.7)
+
+
+def _color(g: int) -> str:
+    return COLORS[g % len(COLORS)]
