@@ -78,6 +78,7 @@ class AnymalClimb(Anymal):
     episode_seconds = 8.0
     observation_size = 282
     goal_names = ("front left", "back left", "front right", "back right")
+    task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(
         self, *, height: float = 0.2, phase: Phase = "A", curriculum: bool = True, **robot: Any
@@ -228,7 +229,7 @@ class AnymalClimb(Anymal):
         return observation.clamp_(-20.0, 20.0)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
-        """Every term of the reward, weighted, per step; their sum is the reward."""
+        """Be on the box at the end; in phase A also walk towards it; walk well."""
         gap, velocity, turning = self._gap(state), state.qvel[:, 0:3], state.qvel[:, 3:6]
         distance, turned = self._distance(state), 1 - self._heading_error(state)[:, 0]
         last = (state.time > self.episode_seconds - TASK_SECONDS).double() / TASK_SECONDS
@@ -253,10 +254,6 @@ class AnymalClimb(Anymal):
         weighted["step"] = self.first_touch(state) * walking
         weighted["fall"] = -FALL_PENALTY * self.fallen(state, LOWEST).double()
         return weighted
-
-    def reward(self, state: State, action: Tensor) -> Tensor:
-        """Be on the box at the end; in phase A also walk towards it; walk well."""
-        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
 
     def terminated(self, state: State) -> Tensor:
         """The robot has fallen, or the time that it observes is over."""

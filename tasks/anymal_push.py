@@ -63,6 +63,7 @@ class AnymalPush(Anymal):
     episode_seconds = 7.0
     observation_size = 51
     goal_names = ("front left", "hind left", "front right", "hind right")
+    task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
         super().__init__(**robot)
@@ -162,7 +163,7 @@ class AnymalPush(Anymal):
         return observation.clamp_(-20.0, 20.0)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
-        """Every term of the reward, weighted, per step; their sum is the reward."""
+        """Approach the cube from behind, move it to the target, hold it there; walk well."""
         distance, gap = self._distance(state), self._gap(state)
         pushing = distance > STOP_DISTANCE
         ahead = gap / distance.clamp(min=1e-6)[:, None]
@@ -186,10 +187,6 @@ class AnymalPush(Anymal):
         weighted["step"] = self.first_touch(state) * pushing
         weighted["fall"] = -FALL_PENALTY * self.fallen(state, LOWEST).double()
         return weighted
-
-    def reward(self, state: State, action: Tensor) -> Tensor:
-        """Approach the cube from behind, move it towards the target, hold it there, walk well."""
-        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
 
     def terminated(self, state: State) -> Tensor:
         """The robot has fallen."""

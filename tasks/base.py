@@ -1,6 +1,6 @@
 """What a task is: one description in torch, batched, from which both faces are made.
 
-A task says how a robot problem looks (observe), what is good (reward), when it is over
+A task says how a robot problem looks (observe), what is good (reward_terms), when it is over
 (terminated), how it starts (sample_goal_state) and how its symmetry group acts on its full state
 (transform_state). It holds no simulation: every method is a function of a `State` of n rows. The
 batched TorchRL environment (environment.py) and the dm_control environment (suite.py) call the same
@@ -65,8 +65,9 @@ class Task(abc.ABC):
     Class attributes a task sets: ``name``; ``asset`` (its file in tasks/assets);
     ``control_timestep`` [s]; ``episode_seconds`` [s]; ``observation_size``; ``action_size``;
     ``goal_names``, one per group element in the group's order; ``carried``, names of objects whose
-    orientation the group only carries along (:func:`~torchrl_sym.mujoco.derive`); and if 1000 is not
-    right, ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged.
+    orientation the group only carries along (:func:`~torchrl_sym.mujoco.derive`); ``task_terms``, names
+    of the reward's terms that are the task itself rather than gait or effort; and if 1000 is not right,
+    ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged.
 
     The group acts on three things that must agree: observations and actions (``symmetry``) and the
     full state (:meth:`transform_state`). Then for every element g, with L_g and K_g of the paper::
@@ -100,6 +101,7 @@ class Task(abc.ABC):
     action_size: ClassVar[int]
     goal_names: ClassVar[tuple[str, ...]]
     carried: ClassVar[tuple[str, ...]] = ()
+    task_terms: ClassVar[tuple[str, ...]] = ()
     max_velocity: float = 1000.0
 
     def __init__(
@@ -198,8 +200,13 @@ class Task(abc.ABC):
         """Observation, a new tensor of shape ``(n, observation_size)``, float32 or float64."""
 
     @abc.abstractmethod
+    def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
+        """Terms of the reward of the step that led to ``state`` by ``action``, weighted, ``(n,)`` each."""
+
     def reward(self, state: State, action: Tensor) -> Tensor:
-        """Reward of the step that led to ``state`` by ``action``, ``(n,)``."""
+        """The sum of the terms, ``(n,)``."""
+        terms = tuple(self.reward_terms(state, action).values())
+        return terms[0] if len(terms) == 1 else torch.stack(terms).sum(dim=0)
 
     def terminated(self, state: State) -> Tensor | None:
         """Whether the episode ends here with no future value, ``(n,)`` bool; None: in no row."""

@@ -62,6 +62,7 @@ class CartPole(Task):
     observation_size = 3
     action_size = 1
     goal_names = ("right", "left")
+    task_terms = ("angle",)
 
     def __init__(self, *, episode_seconds: float | None = None) -> None:
         super().__init__(PointGroup.reflection("x"), episode_seconds=episode_seconds)
@@ -99,9 +100,9 @@ class CartPole(Task):
         torch.div(_angle(state), ANGLE_SCALE, out=observation[:, 1])
         return observation
 
-    def reward(self, state: State, action: Tensor) -> Tensor:
+    def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Minus the pole's distance from upright, over the time of the step, rad s."""
-        return _angle(state).abs().mul_(-self.control_timestep)
+        return {"angle": _angle(state).abs().mul_(-self.control_timestep)}
 
 
 def _angle(state: State) -> Tensor:
