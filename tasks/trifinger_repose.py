@@ -87,6 +87,7 @@ class TrifingerRepose(Task):
     observation_size = 41
     action_size = 9
     goal_names = ("right", "back left", "front left")
+    task_terms = ("keypoints",)
     carried = ("cube", "goal")
     max_velocity = 200.0
 
