@@ -17,6 +17,7 @@ from tests.task_helpers import (
     play,
     stagger,
 )
+from torchrl_sym.representations import invariant
 
 
 @all_tasks
@@ -111,14 +112,11 @@ class Memory(CartPole):
 
     def sample_goal_state(self, n, generator):
         state = super().sample_goal_state(n, generator)
-        state.variables = {"last_action": torch.zeros(n, 1), "level": torch.zeros(n)}
+        state.variables = {"last_action": torch.zeros(n, 1), "level": torch.zeros(n, 1)}
         return state
 
-    def transform_state(self, state, g):
-        image = super().transform_state(state, g)
-        action = self.symmetry["action"](state.variables["last_action"], g)
-        image.variables = state.variables | {"last_action": action}
-        return image
+    def variables(self):
+        return {"last_action": self.robot.actuators, "level": invariant(self.robot.group, 1)}
 
     def restart(self, finished, generator):
         start = super().restart(finished, generator)
@@ -150,7 +148,7 @@ def test_variables_are_updated_after_the_reward_and_kept_per_row():
     batch = play(env, env.reset(), sequence)
     last = torch.cat([torch.zeros(1, 3, 1), sequence[:4], torch.zeros(1, 3, 1), sequence[5:6]])
     torch.testing.assert_close(batch["next", "reward"], -(sequence - last).abs())
-    assert env.state.variables["level"].tolist() == [1.0] * 3
+    assert env.state.variables["level"].tolist() == [[1.0]] * 3
     assert env.task.seen == 3
 
 
