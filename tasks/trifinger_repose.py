@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 
 from tasks.base import Edit, Entry, Task, register
-from tasks.curriculum import Averages
+from tasks.curriculum import Averages, next_level
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation
-from torchrl_sym.representations import polar, quaternion
+from torchrl_sym.representations import invariant, polar, quaternion
 
 FINGERS = ("0", "1", "2")
 JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "lift", "knee"))
@@ -37,6 +37,10 @@ OBSERVATION_LIMIT = 20.0
 CUBE = 0.0325  # half its edge, m
 CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
+# Share of that radius which starts and goals are drawn from at the first level; it grows to 1 at the last.
+FIRST_SHARE, LAST_LEVEL = 0.4, 7
+# An episode that ends farther from its goal, m, lowers the level.
+FAILURE_DISTANCE = 0.06
 LIFT, HIGHEST = 0.0825, 0.1  # goal of difficulty 2 and highest goal of 3 and 4, m
 # Success: position error, m, at difficulty 1 and above, and orientation error, rad, at difficulty 4.
 PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
@@ -63,6 +67,8 @@ class TrifingerRepose(Task):
         difficulty: 1, a place on the table; 2, 82.5 mm above the middle; 3, a place up to 0.1 m high;
             4, the same with an orientation.
         radius: of the disc of start and goal positions, m; at most and by default 0.1387.
+        curriculum: start near the middle, where pushing is easy, and move outwards with success; if not,
+            every episode draws from the whole disc.
         control: ``"torque"``, or ``"position"``: targets of a joint servo within the same torques.
         episode_seconds: length of an episode, s; None for 5 s at difficulty 1, else 15 s.
         physics_timestep: 0.005 s; 0.01 s simulates faster and was good enough to train in.
@@ -96,6 +102,7 @@ class TrifingerRepose(Task):
         *,
         difficulty: int = 1,
         radius: float = ARENA,
+        curriculum: bool = True,
         control: str = "torque",
         episode_seconds: float | None = None,
         physics_timestep: float = 0.005,
@@ -128,7 +135,8 @@ class TrifingerRepose(Task):
         self._turn = torch.stack([turns.cos(), turns.sin()])
         signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
         self._corners = torch.cartesian_prod(signs, signs, signs)
-        self.averages = Averages("success", "error")
+        self.curriculum = curriculum
+        self.averages = Averages("success", "error", "level")
 
     def layout(self) -> tuple[Entry, ...]:
         """Joints, cube, goal, last action."""
@@ -147,24 +155,52 @@ class TrifingerRepose(Task):
         )
 
     def variables(self) -> dict[str, Representation]:
-        """Last action, and distance of every fingertip from the cube one step ago, m."""
+        """Last action, distance of each fingertip from the cube one step ago, m, curriculum level."""
         tips = self.robot.joints([f"knee{finger}" for finger in FINGERS]).absolute()
-        return {"last_action": self.robot.actuators, "tip_distance": tips}
+        level = invariant(self.robot.group, 1)
+        return {"last_action": self.robot.actuators, "tip_distance": tips, "level": level}
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
+        return self._start(torch.full((n,), float(LAST_LEVEL), dtype=torch.float64), generator)
+
+    def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
+        """All goals; the first level, or with ``curriculum=False`` the last."""
+        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        return self._turned(self._start(level, generator), generator)
+
+    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+        """Judge whole episodes: the next one reaches farther out after success, less far after failure."""
+        level = finished.variables["level"][:, 0]
+        whole = finished.time > self.episode_seconds - self.control_timestep / 2
+        whole |= self.terminated(finished)
+        success, error = whole & self.success(finished), self.position_error(finished)
+        self.averages.update(success=success[whole], error=error[whole], level=level[whole])
+        if not self.curriculum:
+            return self.sample_initial_state(len(finished), generator)
+        failure = whole & ~success & (error > FAILURE_DISTANCE)
+        level = next_level(level, success, failure, LAST_LEVEL, generator)
+        return self._turned(self._start(level, generator), generator)
+
+    def _turned(self, state: State, generator: torch.Generator | None) -> State:
+        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
+        return self.transform_state(state, element)
+
+    def _start(self, level: Tensor, generator: torch.Generator | None) -> State:
+        n = len(level)
+        radius = self.radius * (FIRST_SHARE + (1 - FIRST_SHARE) * level / LAST_LEVEL)
         u = torch.rand(n, 17, generator=generator, dtype=torch.float64)
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
         anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)
-        qpos[:, 9:11] = self._place(right if self.difficulty == 2 else anywhere, u[:, 11])
+        qpos[:, 9:11] = _place(radius, right if self.difficulty == 2 else anywhere, u[:, 11])
         qpos[:, 11] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
         half = u[:, 12] * (2 * math.pi)  # half the yaw: over a whole turn, both signs of the quaternion
         qpos[:, 12], qpos[:, 15] = half.cos(), half.sin()
         goal = torch.zeros(n, 1, 3, dtype=torch.float64)
         goal[:, 0, 2] = self._height(u[:, 14])
         if self.difficulty != 2:
-            goal[:, 0, :2] = self._place(right, u[:, 13])
+            goal[:, 0, :2] = _place(radius, right, u[:, 13])
         orientation = qpos[:, 12:16].clone()  # shown where the goal has none
         if self.difficulty == 4:
             drawn = torch.randn(n, 4, generator=generator, dtype=torch.float64)
@@ -174,28 +210,19 @@ class TrifingerRepose(Task):
             qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
             mocap_pos=goal,
             mocap_quat=orientation[:, None],
-            variables={"last_action": torch.zeros(n, 9, dtype=torch.float64)},
+            variables={
+                "last_action": torch.zeros(n, 9, dtype=torch.float64),
+                "level": level[:, None].clone(),
+            },
         )
         state.variables["tip_distance"] = self.tip_distance(state)
         return state
-
-    def _place(self, bearing: Tensor, u: Tensor) -> Tensor:
-        """Uniform over the disc, or a sector of it, ``(n, 2)``."""
-        return (self.radius * u.sqrt())[:, None] * torch.stack([bearing.cos(), bearing.sin()], dim=-1)
 
     def _height(self, u: Tensor) -> Tensor:
         if self.difficulty <= 2:
             return torch.full_like(u, CUBE if self.difficulty == 1 else LIFT)
         lowest = CUBE if self.difficulty == 3 else CUBE_DIAGONAL
         return lowest + (HIGHEST - lowest) * u
-
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
-        """Record how whole episodes ended."""
-        whole = finished.time > self.episode_seconds - self.control_timestep / 2
-        whole |= self.terminated(finished)
-        success, error = self.success(finished), self.position_error(finished)
-        self.averages.update(success=success[whole], error=error[whole])
-        return self.sample_initial_state(len(finished), generator)
 
     def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
         """Mass of the cube and friction; scalars, hence invariant under the group."""
@@ -318,7 +345,7 @@ class TrifingerRepose(Task):
         return close & (self.orientation_error(state) < SUCCESS_ANGLE) if self.difficulty == 4 else close
 
     def metrics(self) -> dict[str, float]:
-        """Success rate and mean final position error (m) of about the last 500 training episodes."""
+        """Success rate, mean final position error (m) and mean level of about the last 500 episodes."""
         return dict(self.averages.values)
 
     def state_dict(self) -> dict[str, Any]:
@@ -328,6 +355,11 @@ class TrifingerRepose(Task):
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.averages.values = dict(saved)
+
+
+def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:
+    """Uniform over a disc, or a sector of it, ``(n, 2)``."""
+    return (radius * u.sqrt())[:, None] * torch.stack([bearing.cos(), bearing.sin()], dim=-1)
 
 
 def _by_joint(finger: tuple[float, ...]) -> Tensor:

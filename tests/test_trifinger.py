@@ -100,7 +100,7 @@ def test_fingertips_in_closed_form_are_those_of_the_model():
 
 @difficulties
 def test_starts_touch_nothing(difficulty):
-    task = TrifingerRepose(difficulty=difficulty)
+    task = TrifingerRepose(difficulty=difficulty, curriculum=False)
     state = task.sample_initial_state(100, generator())
     assert (state.qpos[:, 11] == CUBE + 0.001).all(), "exactly touching, rounding decides what touches"
     for row in range(100):
@@ -124,7 +124,7 @@ def test_no_part_of_a_finger_starts_inside_another_or_the_cube():
 
 @difficulties
 def test_where_cube_and_goal_start(difficulty):
-    task = TrifingerRepose(difficulty=difficulty)
+    task = TrifingerRepose(difficulty=difficulty, curriculum=False)
     state = task.sample_initial_state(4000, generator())
     cube, goal = state.qpos[:, 9:12], state.mocap_pos[:, 0]
     low, high = {1: (CUBE, CUBE), 2: (LIFT, LIFT), 3: (CUBE, HIGHEST), 4: (CUBE_DIAGONAL, HIGHEST)}[
@@ -283,8 +283,23 @@ def test_metrics_tell_how_whole_episodes_ended():
     saved = env.task.state_dict()
     other = TrifingerRepose()
     other.load_state_dict(saved)
-    assert other.metrics() == env.task.metrics() and set(saved) == {"success", "error"}
+    assert other.metrics() == env.task.metrics() and set(saved) == {"success", "error", "level"}
     assert 0 <= saved["success"] <= 1 and 0 < saved["error"] < 2 * ARENA
+
+
+def test_success_moves_starts_outwards_and_failure_inwards():
+    task = TrifingerRepose()
+    state = task.sample_initial_state(300, generator())
+    assert float(state.qpos[:, 9:11].norm(dim=-1).max()) < 0.4 * ARENA
+    state.variables["level"][:] = 3.0
+    state.time[:] = 5.0
+    state.qpos[:100, 9:12] = state.mocap_pos[:100, 0]
+    state.qpos[100:, 9:12] = state.mocap_pos[100:, 0] + torch.tensor([0.05, 0.0, 0.0])
+    state.qpos[200:, 10] += 0.05
+    after = task.restart(state, generator()).variables["level"][:, 0]
+    assert after.tolist() == [4.0] * 100 + [3.0] * 100 + [2.0] * 100
+    state.time[:] = 2.0  # interrupted episodes say nothing
+    assert (task.restart(state, generator()).variables["level"] == 3.0).all()
 
 
 @pytest.mark.parametrize(
