@@ -11,8 +11,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDictBase
@@ -26,7 +25,7 @@ from tasks.state import concatenate
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What one evaluation measured: undiscounted returns, and where the task tells, more.
+    """What one evaluation measured: undiscounted returns, their terms, success.
 
     Attributes:
         goal_names: names of the N equivalent goals, one per group element.
@@ -34,7 +33,7 @@ class Evaluation:
         successes: whether each episode reached its goal, ``(N, episodes)`` bool; None if the task has
             no such notion (:meth:`~tasks.base.Task.success`).
         terms: mean total per episode of every reward term by name, ``(N,)`` float64 each; they add up to
-            the mean returns. None if the task has no ``reward_terms``.
+            the mean returns.
         task_terms: the terms that make up the task, as opposed to gait and effort; may be empty.
 
     Example:
@@ -47,7 +46,7 @@ class Evaluation:
     goal_names: tuple[str, ...]
     returns: Tensor
     successes: Tensor | None = None
-    terms: dict[str, Tensor] | None = None
+    terms: dict[str, Tensor] = field(default_factory=dict)
     task_terms: tuple[str, ...] = ()
 
     @property
@@ -79,7 +78,7 @@ class Evaluation:
     @property
     def task_means(self) -> dict[str, float]:
         """Mean return of each goal from ``task_terms`` alone; empty if the task does not name them."""
-        if self.terms is None or not self.task_terms:
+        if not self.task_terms:
             return {}
         return self._by_goal(torch.stack([self.terms[name] for name in self.task_terms]).sum(dim=0))
 
@@ -98,9 +97,7 @@ def evaluate(
 ) -> Evaluation:
     """Run one episode per goal and start state, all at once.
 
-    Success is judged at the last state of an episode; one whose simulation diverged has failed. Terms of
-    the reward are summed for tasks with a method ``reward_terms(state, action)``, a dictionary of ``(n,)``
-    by name; ``task_terms``, a tuple of names on the task's class, says which of them are the task.
+    Success is judged at the last state of an episode; one whose simulation diverged has failed.
 
     Args:
         env: an environment, whose task is evaluated in simulations of its own (the environment
@@ -149,8 +146,8 @@ def evaluate(
         task.goal_names,
         returns.reshape(shape).cpu(),
         None if successes is None else successes.reshape(shape),
-        {name: x.reshape(shape).mean(dim=1) for name, x in terms.items()} or None,
-        tuple(getattr(task, "task_terms", ())),
+        {name: x.reshape(shape).mean(dim=1) for name, x in terms.items()},
+        task.task_terms,
     )
 
 
@@ -171,7 +168,7 @@ def _run(
     tensordict: TensorDictBase,
 ) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
     """First episode of every row: return ``(n, 1)``, success ``(n,)`` and total of each term ``(n,)``."""
-    task: Any = env.task  # reward_terms is optional
+    task = env.task
     running = ~tensordict["done"]
     returns = torch.zeros(running.shape, dtype=torch.float64, device=running.device)
     successes = task.success(env.state)  # every entry is replaced where its episode ends
@@ -181,15 +178,15 @@ def _run(
         tensordict = env.step(policy(tensordict))
         counted = running.squeeze(-1).cpu() & ~env.simulation.diverged()
         returns += tensordict["next", "reward"].double() * running
-        if hasattr(task, "reward_terms"):
-            state = env.state
-            state.variables = before  # the reward sees the variables from before the step
-            for name, value in task.reward_terms(state, tensordict["action"].cpu()).items():
-                totals[name] = totals.get(name, 0.0) + value.double().masked_fill(~counted, 0.0)
         ended = running & tensordict["next", "done"]
+        state = env.state
         if successes is not None and bool(ended.any()):
-            reached = task.success(env.state) & counted
-            successes = torch.where(ended.squeeze(-1).cpu(), reached, successes)
+            reached = task.success(state)
+            assert reached is not None
+            successes = torch.where(ended.squeeze(-1).cpu(), reached & counted, successes)
+        state.variables = before  # the reward sees the variables from before the step
+        for name, value in task.reward_terms(state, tensordict["action"].cpu()).items():
+            totals[name] = totals.get(name, 0.0) + value.double().masked_fill(~counted, 0.0)
         running &= ~ended
         tensordict = step_mdp(tensordict)
     return returns, successes, totals

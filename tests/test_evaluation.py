@@ -6,6 +6,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
+from tasks.base import Task
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tests.task_helpers import Falling, all_tasks, make
@@ -110,8 +111,7 @@ class Measured(Falling):
             "alive": torch.full((len(state),), 0.5, dtype=torch.float64),
         }
 
-    def reward(self, state, action):
-        return sum(self.reward_terms(state, action).values())
+    reward = Task.reward
 
     def success(self, state):
         return state.qpos[:, 1] > 0
@@ -166,10 +166,12 @@ def test_a_simulation_that_diverged_has_failed_and_earns_nothing_more():
     assert result.returns[0, 1] < 0.5 * result.returns[0, 0]
 
 
-def test_tasks_without_success_and_terms():
+def test_a_task_without_a_notion_of_success():
     result = evaluate("cartpole", noisy(), 2, num_threads=1)
-    assert result.successes is result.success is result.terms is None
-    assert result.goal_successes == result.task_means == {}
+    assert result.successes is None and result.success is None
+    assert result.goal_successes == {}
+    assert result.task_means == pytest.approx(result.goal_means)
+    assert Evaluation(("a",), torch.ones(1, 1)).task_means == {}
 
 
 def test_sampled_actions_follow_the_seed_and_leave_the_random_numbers_alone():
@@ -196,6 +198,5 @@ def test_terms_of_every_task_add_up_to_its_return(name):
     policy = TensorDictModule(lambda x: still.expand(len(x), -1), ["observation"], ["action"])
     result = evaluate(env, policy, 2, num_threads=1)
     assert result.returns.shape == (len(env.task.goal_names), 2)
-    if result.terms is not None:
-        torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
-        assert set(result.task_terms) <= set(result.terms)
+    torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
+    assert set(result.task_means) == set(env.task.goal_names)
