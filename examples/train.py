@@ -1,19 +1,20 @@
-"""Train a task from the command line: `python examples/train.py --help`.
+"""Train a task from the command line, with its own settings: `python examples/train.py --help`.
 
-    python examples/train.py --task cartpole --folder runs/cartpole --config.augmentation all
+    python examples/train.py anymal_push --folder runs/push --config.augmentation all
 
 The run can be killed and started again: it continues where its last checkpoint was.
 """
 
 import functools
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import tyro
 
 import tasks
 from tasks.evaluation import evaluate
+from tasks.settings import SETTINGS
 from torchrl_sym.recipes import PPOConfig, load_actor, train
 
 
@@ -21,21 +22,27 @@ from torchrl_sym.recipes import PPOConfig, load_actor, train
 class Arguments:
     """Train PPO with symmetry on one of the tasks, then evaluate every equivalent goal."""
 
-    task: Literal[tasks.ALL_TASKS] = "cartpole"  # type: ignore[valid-type]
+    task: tyro.conf.Fixed[str]
     """What to train."""
+    config: PPOConfig
+    """Hyper-parameters."""
+    task_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the task in training."""
     folder: str = "runs/train"
     """Where metrics.csv and checkpoint.pt go."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
     """Where metrics go besides metrics.csv."""
+    episodes: int = 500
+    """Evaluation episodes per goal."""
     threads: int = 1
     """Physics threads; networks use one."""
-    config: PPOConfig = field(default_factory=PPOConfig)
-    """Hyper-parameters."""
 
 
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    make_env = functools.partial(tasks.make_env, arguments.task, num_threads=arguments.threads)
+    make_env = functools.partial(
+        tasks.make_env, arguments.task, num_threads=arguments.threads, **arguments.task_kwargs
+    )
     env = make_env(num_envs=1, seed=0)
     for _ in train(
         arguments.config,
@@ -46,11 +53,16 @@ def main(arguments: Arguments) -> None:
         progress=True,
     ):
         pass
-    result = evaluate(env, load_actor(arguments.folder, env, env.symmetry))
+    result = evaluate(env, load_actor(arguments.folder, env, env.symmetry), arguments.episodes)
     print(f"mean return {result.mean:.3f}, variation {result.variation:.3f}")
     for goal, value in result.goal_means.items():
-        print(f"  {goal:12s} {value:.3f}")
+        success = result.goal_successes.get(goal)
+        print(f"  {goal:12s} {value:.3f}" + (f", success {success:.1%}" if success is not None else ""))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Arguments))
+    choices = {
+        name: (f"train {name}", Arguments(name, setting.config, dict(setting.task)))
+        for name, setting in SETTINGS.items()
+    }
+    main(tyro.extras.overridable_config_cli(choices))

@@ -1,0 +1,156 @@
+"""Does a robot task learn? Train it with its settings, evaluate every goal, draw the curve.
+
+    python benchmarks/learn.py anymal_push            # trains for as long as tasks/settings.py says
+    python benchmarks/learn.py anymal_push --plot     # draws again from the results alone
+
+The run can be killed and started again. Results go to benchmarks/results/learn/TASK: metrics.csv (the whole
+curve), result.json (settings, versions, evaluation), checkpoint.pt (the policy alone) and curve.png. The
+policy is evaluated in steps of 0.005 s whatever it was trained in, with its mean action and with sampled
+ones, on as many episodes for every equivalent goal.
+"""
+
+import dataclasses
+import functools
+import json
+import platform
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import mujoco
+import tensordict
+import torch
+import torchrl
+import tyro
+from torchrl.envs.utils import ExplorationType
+
+import tasks
+from tasks.evaluation import evaluate
+from tasks.settings import SETTINGS, Setting
+from torchrl_sym.recipes import export_actor, load_actor, read_metrics, train
+
+RESULTS = Path(__file__).parent / "results" / "learn"
+
+
+@dataclass
+class Arguments:
+    """Train a task with its settings, then evaluate and draw."""
+
+    task: tyro.conf.Positional[str]
+    """One of tasks.ALL_TASKS."""
+    iterations: int | None = None
+    """Collect-and-learn rounds, instead of the settings'."""
+    num_envs: int | None = None
+    """Simulations, instead of the settings'."""
+    augmentation: str | None = None
+    """none, all, random or naive, instead of the settings'."""
+    seed: int = 0
+    """Seed of weights, starts and exploration."""
+    episodes: int = 500
+    """Evaluation episodes per goal."""
+    folder: Path = Path("runs/learn")
+    """Where the full checkpoint goes, in a folder of the task's name."""
+    output: Path = RESULTS
+    """Where results go, in a folder of the task's name."""
+    task_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Arguments of the task in evaluation, such as the height of the box."""
+    plot: bool = False
+    """Only draw."""
+
+
+def main(arguments: Arguments) -> None:
+    torch.set_num_threads(1)
+    output = arguments.output / arguments.task
+    if not arguments.plot:
+        setting = chosen(arguments)
+        folder = arguments.folder / arguments.task
+        make_env = functools.partial(tasks.make_env, arguments.task, num_threads=1, **setting.task)
+        symmetry = make_env(num_envs=1).symmetry
+        for _ in train(setting.config, make_env, symmetry, folder=folder, progress=True):
+            pass
+        report(arguments, setting, folder, output)
+    draw(output)
+    print(f"written to {output}")
+
+
+def chosen(arguments: Arguments) -> Setting:
+    """The task's setting with what the command line replaces."""
+    setting = SETTINGS[arguments.task]
+    changes = {
+        name: getattr(arguments, name)
+        for name in ("iterations", "num_envs", "augmentation", "seed")
+        if getattr(arguments, name) is not None
+    }
+    return dataclasses.replace(setting, config=dataclasses.replace(setting.config, **changes))
+
+
+def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -> None:
+    """Evaluate the last policy, and write everything that the pictures need."""
+    export_actor(folder, output)
+    (output / "metrics.csv").write_bytes((folder / "metrics.csv").read_bytes())
+    env = tasks.make_env(arguments.task, num_envs=1, num_threads=2, **arguments.task_kwargs)
+    actor = load_actor(output, env, env.symmetry)
+    last = read_metrics(output / "metrics.csv")[-1]
+    result = {
+        "command": "python " + " ".join(sys.argv),
+        "config": dataclasses.asdict(setting.config),
+        "training_task": setting.task,
+        "evaluation_task": arguments.task_kwargs,
+        "frames": last["frames"],
+        "minutes": last["seconds"] / 60,
+        "machine": f"{platform.machine()}, one process, one thread",
+        "revision": revision(),
+        "versions": {
+            "python": platform.python_version(),
+            **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
+        },
+    }
+    for name, exploration in (
+        ("deterministic", ExplorationType.DETERMINISTIC),
+        ("sampled", ExplorationType.RANDOM),
+    ):
+        outcome = evaluate(env, actor, arguments.episodes, seed=1000, exploration=exploration)
+        result[name] = {
+            "episodes_per_goal": arguments.episodes,
+            "success": outcome.success,
+            "goal_successes": outcome.goal_successes,
+            "return": outcome.mean,
+            "variation": outcome.variation,
+            "goal_returns": outcome.goal_means,
+            "goal_task_returns": outcome.task_means,
+            "terms": {term: float(x.mean()) for term, x in (outcome.terms or {}).items()},
+        }
+        print(f"{name}: success {outcome.success}, {outcome.goal_successes}")
+    (output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+
+
+def revision() -> str:
+    """The commit that made the results."""
+    command = ["git", "rev-parse", "--short", "HEAD"]
+    out = subprocess.run(command, cwd=RESULTS.parent, capture_output=True, text=True)
+    return out.stdout.strip() or "unknown"
+
+
+def draw(output: Path) -> None:
+    """Success, curriculum and return over environment steps."""
+    rows = read_metrics(output / "metrics.csv")
+    names = [
+        name for name in ("success", "level", "error", "distance", "phase", "return") if name in rows[0]
+    ]
+    steps = [row["frames"] / 1e6 for row in rows]
+    figure, axes = plt.subplots(1, len(names), figsize=(3.2 * len(names), 2.8), layout="constrained")
+    for axis, name in zip([axes] if len(names) == 1 else axes, names, strict=True):
+        axis.plot(steps, [row[name] for row in rows], color="tab:blue", linewidth=1.2)
+        axis.set(xlabel="environment steps (millions)", title=name)
+        axis.grid(alpha=0.3)
+        if name == "success":
+            axis.set_ylim(0, 1)
+    figure.savefig(output / "curve.png", dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
