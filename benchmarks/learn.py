@@ -15,7 +15,7 @@ import json
 import platform
 import subprocess
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -55,8 +55,6 @@ class Arguments:
     """Where the full checkpoint goes, in a folder of the task's name."""
     output: Path = RESULTS
     """Where results go, in a folder of the task's name."""
-    task_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Arguments of the task in evaluation, such as the height of the box."""
     plot: bool = False
     """Only draw."""
 
@@ -91,14 +89,11 @@ def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -
     """Evaluate the last policy, and write everything that the pictures need."""
     export_actor(folder, output)
     (output / "metrics.csv").write_bytes((folder / "metrics.csv").read_bytes())
-    env = tasks.make_env(arguments.task, num_envs=1, num_threads=2, **arguments.task_kwargs)
-    actor = load_actor(output, env, env.symmetry)
     last = read_metrics(output / "metrics.csv")[-1]
     result = {
         "command": "python " + " ".join(sys.argv),
         "config": dataclasses.asdict(setting.config),
         "training_task": setting.task,
-        "evaluation_task": arguments.task_kwargs,
         "frames": last["frames"],
         "minutes": last["seconds"] / 60,
         "machine": f"{platform.machine()}, one process, one thread",
@@ -108,6 +103,18 @@ def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -
             **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
         },
     }
+    result["evaluation"] = {
+        what: {**kwargs, **evaluation(arguments, output, kwargs)}
+        for what, kwargs in setting.evaluations.items()
+    }
+    (output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+
+
+def evaluation(arguments: Arguments, output: Path, task: dict[str, Any]) -> dict[str, Any]:
+    """Every goal, with the mean action and with sampled ones."""
+    env = tasks.make_env(arguments.task, num_envs=1, num_threads=2, **task)
+    actor = load_actor(output, env, env.symmetry)
+    result = {}
     for name, exploration in (
         ("deterministic", ExplorationType.DETERMINISTIC),
         ("sampled", ExplorationType.RANDOM),
@@ -123,8 +130,9 @@ def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -
             "goal_task_returns": outcome.task_means,
             "terms": {term: float(x.mean()) for term, x in (outcome.terms or {}).items()},
         }
-        print(f"{name}: success {outcome.success}, {outcome.goal_successes}")
-    (output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+        rates = ", ".join(f"{goal} {rate:.1%}" for goal, rate in outcome.goal_successes.items())
+        print(f"{task or 'task'}, {name}: success {rates}")
+    return result
 
 
 def revision() -> str:

@@ -20,10 +20,12 @@ class Setting:
     Attributes:
         config: hyper-parameters of :func:`torchrl_sym.recipes.train`.
         task: arguments of the task in training.
+        evaluations: arguments of the task in evaluation, by what is evaluated.
     """
 
     config: PPOConfig
     task: dict[str, Any] = field(default_factory=dict)
+    evaluations: dict[str, dict[str, Any]] = field(default_factory=lambda: {"task": {}})
 
 
 # An action of 1 moves a target by 2 rad, a walking robot's by some 0.5 rad: networks put out quarters, and
@@ -52,6 +54,10 @@ _FAST = {"physics_timestep": 0.01}
 SETTINGS: dict[str, Setting] = {
     "cartpole": Setting(PPOConfig()),
     "anymal_push": Setting(dataclasses.replace(_ANYMAL, iterations=976), _FAST),  # 12.0 M steps
-    "anymal_climb": Setting(dataclasses.replace(_ANYMAL, iterations=3255), _FAST),  # 40.0 M steps
+    "anymal_climb": Setting(  # 40.0 M steps
+        dataclasses.replace(_ANYMAL, iterations=3255),
+        _FAST,
+        {"facing the box": {"phase": "B"}, "any heading": {"phase": "C"}},
+    ),
 }
 """Settings by task name."""
