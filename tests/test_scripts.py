@@ -87,6 +87,14 @@ def test_watch_draws_paths_from_above(tmp_path):
     assert picture.stat().st_size > 10_000
 
 
+def test_the_page_about_the_tasks_is_what_the_code_says(tmp_path):
+    run("benchmarks/tasks_page.py", "--out", tmp_path / "tasks.md")
+    written, docs = (tmp_path / "tasks.md").read_text(), ROOT / "docs"
+    assert written == (docs / "tasks.md").read_text(), "run python benchmarks/tasks_page.py"
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", written)
+    assert [picture for picture in pictures if not (docs / picture).exists()] == []
+
+
 @pytest.mark.slow
 def test_speed_writes_its_figures(tmp_path):
     figures = tmp_path / "speed.json"
