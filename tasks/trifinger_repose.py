@@ -28,9 +28,6 @@ FINGERS = ("0", "1", "2")
 JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "lift", "knee"))
 # How far joints start from the model's reference pose, which observed positions are relative to, rad.
 START_NOISE = 0.1
-# Position control: targets around a pose, rad, and gains, N m/rad and N m s/rad.
-TARGET_POSE, TARGET_RANGE = (0.0, 0.9, -1.7), (0.5, 0.6, 0.8)
-STIFFNESS, TARGET_DAMPING = (4.0, 4.0, 2.0), (0.15, 0.15, 0.075)
 # What observations are multiplied by: a fingertip's m and rad/s are far from 1.
 JOINT_VELOCITY_SCALE, POSITION_SCALE = 0.1, 10.0
 OBSERVATION_LIMIT = 20.0
@@ -69,7 +66,6 @@ class TrifingerRepose(Task):
         radius: of the disc of start and goal positions, m; at most and by default 0.1387.
         curriculum: start near the middle, where pushing is easy, and move outwards with success; if not,
             every episode draws from the whole disc.
-        control: ``"torque"``, or ``"position"``: targets of a joint servo within the same torques.
         episode_seconds: length of an episode, s; None for 5 s at difficulty 1, else 15 s.
         physics_timestep: 0.005 s; 0.01 s simulates faster and was good enough to train in.
         cube_mass: range of the cube's mass, kg, drawn per episode; None keeps 0.08.
@@ -103,18 +99,14 @@ class TrifingerRepose(Task):
         difficulty: int = 1,
         radius: float = ARENA,
         curriculum: bool = True,
-        control: str = "torque",
         episode_seconds: float | None = None,
         physics_timestep: float = 0.005,
         cube_mass: tuple[float, float] | None = None,
         friction: tuple[float, float] | None = None,
         weak_finger: int | None = None,
     ) -> None:
-        if difficulty not in (1, 2, 3, 4) or control not in ("torque", "position"):
-            raise ValueError(
-                "expected a difficulty of 1, 2, 3 or 4 and control 'torque' or 'position', got "
-                f"{difficulty!r} and {control!r}"
-            )
+        if difficulty not in (1, 2, 3, 4):
+            raise ValueError(f"expected a difficulty of 1, 2, 3 or 4, got {difficulty!r}")
         if not 0 < radius <= ARENA or weak_finger not in (None, 0, 1, 2):
             raise ValueError(
                 f"expected a radius in (0, {ARENA}] m and a weak_finger among 0, 1, 2 or None, got "
@@ -123,14 +115,13 @@ class TrifingerRepose(Task):
         for what, span in {"cube_mass": cube_mass, "friction": friction}.items():
             if span is not None and not 0 < span[0] <= span[1]:
                 raise ValueError(f"{what}: expected a rising, positive range, got {span}")
-        self.difficulty, self.radius, self.position_control = difficulty, radius, control == "position"
+        self.difficulty, self.radius = difficulty, radius
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
-        edit = _edit(physics_timestep, self.position_control, weak_finger)
+        edit = _edit(physics_timestep, weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
         self.cube_mass, self.friction = cube_mass, friction
         self._start_pose = torch.from_numpy(self.model.qpos0[:9].copy())
         self._torque = float(self.model.actuator_ctrlrange[0, 1])  # the same for all
-        self._target_pose, self._target_range = _by_joint(TARGET_POSE), _by_joint(TARGET_RANGE)
         turns = -torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
         self._turn = torch.stack([turns.cos(), turns.sin()])
         signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
@@ -241,11 +232,8 @@ class TrifingerRepose(Task):
             simulation.refresh(ids)
 
     def control(self, action: Tensor, state: State) -> Tensor:
-        """Torques, N m; or joint targets, rad."""
-        action = action.double().clamp(-1.0, 1.0)
-        if self.position_control:
-            return self._target_pose + self._target_range * action
-        return self._torque * action
+        """Torques, N m."""
+        return action.double().clamp(-1.0, 1.0) * self._torque
 
     def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Remember the action and the distances of the fingertips."""
@@ -362,10 +350,6 @@ def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:
     return (radius * u.sqrt())[:, None] * torch.stack([bearing.cos(), bearing.sin()], dim=-1)
 
 
-def _by_joint(finger: tuple[float, ...]) -> Tensor:
-    return torch.tensor(finger * 3, dtype=torch.float64)
-
-
 def _matrix(quaternion: Tensor) -> Tensor:
     """Rotation matrices, ``(n, 3, 3)``, of unit quaternions (w, x, y, z)."""
     w, x, y, z = quaternion.unbind(-1)
@@ -377,17 +361,11 @@ def _matrix(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def _edit(timestep: float, position_control: bool, weak_finger: int | None) -> Edit:
+def _edit(timestep: float, weak_finger: int | None) -> Edit:
     def edit(spec) -> None:
         spec.option.timestep = timestep
-        for index, joint in enumerate(JOINTS):
-            actuator, kind = spec.actuator(joint), index % 3
-            if position_control:
-                low, high = TARGET_POSE[kind] - TARGET_RANGE[kind], TARGET_POSE[kind] + TARGET_RANGE[kind]
-                actuator.ctrlrange = [low, high]
-                actuator.gainprm[0] = STIFFNESS[kind]
-                actuator.biasprm[1:3] = [-STIFFNESS[kind], -TARGET_DAMPING[kind]]
-            if weak_finger is not None and joint.endswith(str(weak_finger)):
-                actuator.forcerange = actuator.forcerange / 2
+        for joint in JOINTS if weak_finger is not None else ():
+            if joint.endswith(str(weak_finger)):
+                spec.actuator(joint).forcerange = spec.actuator(joint).forcerange / 2
 
     return edit

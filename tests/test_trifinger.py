@@ -46,9 +46,8 @@ def single(task, state, row=0):
     return data
 
 
-@pytest.mark.parametrize("control", ["torque", "position"])
-def test_the_model_is_exactly_symmetric(control):
-    task = TrifingerRepose(control=control)
+def test_the_model_is_exactly_symmetric():
+    task = TrifingerRepose()
     assert audit(task.model, C3, carried=task.carried).exact
 
 
@@ -306,7 +305,6 @@ def test_success_moves_starts_outwards_and_failure_inwards():
     "wrong",
     [
         {"difficulty": 5},
-        {"control": "servo"},
         {"radius": 0.2},
         {"weak_finger": 3},
         {"friction": (0.0, 1.0)},
