@@ -283,7 +283,10 @@ def overlay(task: Task, states: Sequence[State], elements: Sequence[int]) -> Fig
         if last is not None:
             for row, g in enumerate(elements):
                 axes.plot(*last[row, :, :2].numpy().T, "s", color=_color(g), markersize=9, alpha=0.4)
-        axes.set(title=title, xlabel="x [m]", aspect="equal")
+        # The group acts about the origin: a square around it is the same picture for all elements.
+        reach = 1.05 * float(np.abs(axes.dataLim.get_points()).max())
+        axes.set(title=title, xlabel="x [m]", aspect="equal", xlim=(-reach, reach), ylim=(-reach, reach))
+        axes.locator_params(nbins=5)
         axes.grid(alpha=0.3)
         states = [task.transform_state(state, back) for state in states]
     panels[0].set_ylabel("y [m]")
