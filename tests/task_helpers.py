@@ -10,6 +10,20 @@ from tasks.environment import BatchedEnv
 
 all_tasks = pytest.mark.parametrize("name", tasks.ALL_TASKS)
 
+# Keyword arguments under which a task's physics, starts or reward differ.
+SETTINGS = {
+    "cartpole": ({},),
+    "anymal_push": (
+        {"curriculum": False},
+        {"friction": (0.5, 1.2), "added_mass": (-2.0, 4.0), "physics_timestep": 0.01},
+    ),
+    "anymal_climb": ({"phase": "A"}, {"phase": "C", "curriculum": False, "height": 0.3}),
+    "trifinger_repose": ({"difficulty": 1}, {"difficulty": 2}, {"difficulty": 4, "control": "position"}),
+}
+all_settings = pytest.mark.parametrize(
+    ("name", "kwargs"), [(name, kwargs) for name in tasks.ALL_TASKS for kwargs in SETTINGS[name]]
+)
+
 
 def make(name, num_envs=4, seed=0, **kwargs):
     return tasks.make_env(name, num_envs=num_envs, num_threads=1, seed=seed, **kwargs)
@@ -42,6 +56,29 @@ def stagger(env):
     start.time[:] = torch.linspace(0, 0.98 * limit, len(start), dtype=torch.float64)
     start.time.div_(env.task.control_timestep).round_().mul_(env.task.control_timestep)
     return env.reset_to(start)
+
+
+def starting_at(task, states, num_envs=16):
+    """An environment whose episodes start in one of these states or in one of their images."""
+
+    def draw(n, generator):
+        ids = torch.randint(len(states), (n,), generator=generator)
+        element = torch.randint(task.symmetry.group.order, (n,), generator=generator)
+        return task.transform_state(states.rows(ids), element)
+
+    task.sample_initial_state = draw
+    task.restart = lambda finished, generator: draw(len(finished), generator)
+    return BatchedEnv(task, num_envs, num_threads=1, seed=0)
+
+
+def reached(task, start, steps, scale=0.0):
+    """The states after some steps of random actions, of the rows that are still in their episode."""
+    env = BatchedEnv(task, len(start), num_threads=1, seed=0)
+    env.reset_to(start)
+    alive = torch.ones(len(start), dtype=torch.bool)
+    for action in actions(env, steps, scale=scale):
+        alive &= ~env.step(TensorDict(action=action, batch_size=env.batch_size))["next", "done"][:, 0]
+    return env.state.rows(alive)
 
 
 def equivariance_error(task, symmetry, g, steps=100, n=16):
