@@ -223,18 +223,10 @@ class WrongLegObserved(AnymalPush):
         return super().observe(state)[:, order]
 
 
-class WrongLegMoved(AnymalPush):
-    def control(self, action, state):
-        return super().control(action, state)[:, [6, 7, 8, 3, 4, 5, 0, 1, 2, 9, 10, 11]]
-
-
-@pytest.mark.parametrize(
-    ("broken", "part"), [(WrongLegObserved, "kinematics"), (WrongLegMoved, "dynamics")]
-)
-def test_swapped_legs_are_caught(broken, part):
-    env = BatchedEnv(broken(), 8, num_threads=1, seed=0)
+def test_swapped_legs_are_caught():
+    env = BatchedEnv(WrongLegObserved(), 8, num_threads=1, seed=0)
     report = verify(env, env.symmetry, tolerance=1e-9, states=8)
-    assert report.worst.part == part, str(report)
+    assert report.worst.part == "kinematics", str(report)
 
 
 def test_swapped_legs_in_the_representation_are_caught():
