@@ -48,7 +48,7 @@ class Anymal(Task):
     Args:
         episode_seconds: length of an episode, s; None for the task's own.
         physics_timestep: 0.005 s; 0.01 s simulates 1.65 times as fast and was good enough to train in.
-        friction: range of the sliding friction of the ground, drawn per episode; None keeps the model's.
+        friction: range of a factor on all sliding friction, drawn per episode; None keeps the model's.
         added_mass: range of the mass added to the base, kg, drawn per episode; None adds none.
         payload: mass in kg fixed on top of the base at ``payload_position``, for studies of asymmetry.
         payload_position: where, in the base frame, m. Off the centre, the robot is no longer symmetric.
@@ -232,7 +232,8 @@ class Anymal(Task):
         if self.friction is not None:
             low, high = self.friction
             draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
-            simulation.expand("geom_friction")[ids, :, 0] = draw[:, None]
+            own = torch.as_tensor(self.model.geom_friction[:, 0].copy())
+            simulation.expand("geom_friction")[ids, :, 0] = draw[:, None] * own
         if self.added_mass is not None:
             low, high = self.added_mass
             draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)

@@ -20,7 +20,7 @@ from tasks.state import State
 from torchrl_sym import Representation
 from torchrl_sym.representations import invariant, polar
 
-CUBE = 0.25  # half its edge, m
+CUBE = 0.3  # half its edge, m
 # Where the cube starts: distance from the robot, m, and how far a face is turned from it, rad.
 CUBE_DISTANCE, CUBE_TURN = (1.0, 1.3), 0.3
 # How far behind the cube the target is, m: 0.3 + 0.15 level U(0.5, 1), at most 1.35 at the last level.
@@ -28,19 +28,21 @@ NEAREST_TARGET, TARGET_STEP, LAST_LEVEL = 0.3, 0.15, 7
 SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
 # Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
 STOP_DISTANCE = 0.12
-# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, m.
-SPEED, APPROACH_DISTANCE = 0.6, 0.25
+# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, by this much, m,
+# plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the line
+# is asked to get behind the cube before it pushes on.
+SPEED, BEHIND, DETOUR = 0.6, 0.3, 0.6
 BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
 FALL_PENALTY = 5.0
 # Weights of the reward's terms. The first group is the task; the others ask for a gait that lasts.
-TASK_WEIGHTS = {"velocity": 4.0, "progress": 6.0, "tracking": 0.5}
+TASK_WEIGHTS = {"velocity": 4.0, "progress": 10.0, "tracking": 1.0}
 GAIT_WEIGHTS = {"alive": 0.5, "height": -20.0, "vertical": -1.0, "rolling": -0.05, "tilt": -1.0}
 EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.005}
 
 
 @register
 class AnymalPush(Anymal):
-    """Push a cube of 0.5 m and 5 kg to a target 0.3 to 1.35 m away.
+    """Push a cube of 0.6 m and 5 kg to a target 0.3 to 1.35 m away.
 
     Group: Klein four. Observation: 45 proprioceptive numbers, cube and target position in the base frame.
     An episode succeeds if the cube ends within 0.2 m of the target.
@@ -62,7 +64,7 @@ class AnymalPush(Anymal):
     asset = "anymal_push.xml"
     episode_seconds = 7.0
     observation_size = 51
-    goal_names = ("front left", "hind left", "front right", "hind right")
+    goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
@@ -167,14 +169,16 @@ class AnymalPush(Anymal):
         distance, gap = self._distance(state), self._gap(state)
         pushing = distance > STOP_DISTANCE
         ahead = gap / distance.clamp(min=1e-6)[:, None]
-        to_point = state.qpos[:, 19:21] - APPROACH_DISTANCE * ahead - state.qpos[:, 0:2]
+        to_cube = state.qpos[:, 19:21] - state.qpos[:, 0:2]
+        aside = (to_cube[:, 0] * ahead[:, 1] - to_cube[:, 1] * ahead[:, 0]).abs().clamp(max=DETOUR)
+        to_point = to_cube - (BEHIND + aside)[:, None] * ahead
         asked = SPEED * to_point / to_point.norm(dim=-1, keepdim=True).clamp(min=1e-6) * pushing[:, None]
         velocity, turning, turn = state.qvel[:, 0:3], state.qvel[:, 3:6], rotation(state)
         progress = (state.variables["distance"][:, 0] - distance) / self.control_timestep
         terms = {
             "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp(),
             "progress": progress.clamp(-1.5, 1.5),
-            "tracking": 1 / (1 + (distance / 0.5).square()),
+            "tracking": 1 / (1 + (distance / 0.3).square()),
             "alive": torch.ones_like(distance),
             "height": (state.qpos[:, 2] - BASE_HEIGHT).square(),
             "vertical": velocity[:, 2].square(),
