@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from tasks.base import Edit, Entry, Task
+from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation
 from torchrl_sym.representations import axial, invariant, polar
@@ -245,17 +246,6 @@ class Anymal(Task):
 def rotation(state: State) -> Tensor:
     """Rotation of the base, ``(n, 3, 3)``: base frame to world."""
     return state.shared("rotation", lambda: matrix_of(state.qpos[:, 3:7]))
-
-
-def matrix_of(quaternion: Tensor) -> Tensor:
-    """Rotation matrix of unit quaternions ``(n, 4)``, (w, x, y, z)."""
-    w, x, y, z = quaternion.unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def into_base(turn: Tensor, vector: Tensor) -> Tensor:

@@ -116,7 +116,7 @@ class AnymalClimb(Anymal):
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
         level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
-        return self._turned(self._start(level, generator, vary=0.2 * self.curriculum), generator)
+        return self.mapped_at_random(self._start(level, generator, vary=0.2 * self.curriculum), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: higher boxes after success, lower ones after failure, the next phase."""
@@ -130,17 +130,13 @@ class AnymalClimb(Anymal):
         self._advance()
         failure = whole & ~success & (fallen | (distance > FAILURE_DISTANCE))
         level = next_level(level, whole & success, failure, LAST_LEVEL, generator)
-        return self._turned(self._start(level, generator, vary=0.2), generator)
+        return self.mapped_at_random(self._start(level, generator, vary=0.2), generator)
 
     def _advance(self) -> None:
         values = self.averages.values
         if self.phase != "C" and values["success"] > PHASE_SUCCESS and values["level"] > PHASE_LEVEL:
             self.phase = "B" if self.phase == "A" else "C"
             self.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
-
-    def _turned(self, state: State, generator: torch.Generator | None) -> State:
-        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
-        return self.transform_state(state, element)
 
     def _start(self, level: Tensor, generator: torch.Generator | None, vary: float) -> State:
         """Starts with the box in front, its centre on the left.

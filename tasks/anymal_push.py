@@ -28,9 +28,9 @@ NEAREST_TARGET, TARGET_STEP, LAST_LEVEL = 0.3, 0.15, 7
 SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
 # Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
 STOP_DISTANCE = 0.12
-# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, by this much, m,
-# plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the line
-# is asked to get behind the cube before it pushes on.
+# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, by this much,
+# m, plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the
+# line is asked to get behind the cube before it pushes on.
 SPEED, BEHIND, DETOUR = 0.6, 0.3, 0.6
 BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
 FALL_PENALTY = 5.0
@@ -94,7 +94,8 @@ class AnymalPush(Anymal):
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Any direction; near targets, or with ``curriculum=False`` the whole range."""
         level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
-        return self._turned(self._start(level, generator, spread=0.5), generator)
+        start = self._start(level, generator, spread=0.5 if self.curriculum else 0.0)
+        return self.mapped_at_random(start, generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: the next target is farther after success, nearer after no progress."""
@@ -108,11 +109,7 @@ class AnymalPush(Anymal):
             return self.sample_initial_state(len(finished), generator)
         failure = whole & ~success & (distance > 0.7 * start)
         level = next_level(level, success, failure, LAST_LEVEL, generator)
-        return self._turned(self._start(level, generator, spread=0.5), generator)
-
-    def _turned(self, state: State, generator: torch.Generator | None) -> State:
-        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
-        return self.transform_state(state, element)
+        return self.mapped_at_random(self._start(level, generator, spread=0.5), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None, spread: float) -> State:
         """Starts with the cube in front on the left and the target behind it.

@@ -158,8 +158,11 @@ class Task(abc.ABC):
 
         Mapping each draw by a uniformly drawn element makes the distribution exactly symmetric.
         """
-        state = self.sample_goal_state(n, generator)
-        element = torch.randint(self.symmetry.group.order, (n,), generator=generator)
+        return self.mapped_at_random(self.sample_goal_state(n, generator), generator)
+
+    def mapped_at_random(self, state: State, generator: torch.Generator | None) -> State:
+        """Every row mapped by a uniformly drawn element: makes any distribution exactly symmetric."""
+        element = torch.randint(self.symmetry.group.order, (len(state),), generator=generator)
         return self.transform_state(state, element)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
