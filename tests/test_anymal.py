@@ -248,7 +248,9 @@ def test_physics_is_drawn_per_row_and_only_for_rows_that_start(name):
     mass = env.simulation.expand("body_mass")[:, env.task.model.body("base").id]
     before = friction.clone(), mass.clone()
     assert len(friction[:, 0, 0].unique()) == len(mass.unique()) == 6
-    assert (friction[:, :, 0] >= 0.5).all() and (friction[:, :, 0] <= 1.2).all()
+    factor = friction[:, :, 0] / torch.from_numpy(env.task.model.geom_friction[:, 0])
+    torch.testing.assert_close(factor, factor[:, :1].expand_as(factor))  # the same for all geoms of a row
+    assert (factor >= 0.5).all() and (factor <= 1.2).all()
     assert (mass >= nominal - 2).all() and (mass <= nominal + 4).all()
     mask = torch.tensor([True, False, False, True, False, False])
     td["_reset"] = mask[:, None]

@@ -219,7 +219,7 @@ class ShiftedMap(AnymalClimb):
 class BoxAhead(AnymalClimb):
     """Starts always with the box ahead, on either side."""
 
-    def _turned(self, state, generator):
+    def mapped_at_random(self, state, generator):
         element = 2 * torch.randint(2, (len(state),), generator=generator)
         return self.transform_state(state, element)
 

@@ -99,7 +99,6 @@ def test_a_higher_level_moves_the_target_away(level):
         torch.testing.assert_close(start.variables[name][:, 0], distance, rtol=0, atol=1e-12)
 
 
-@pytest.mark.xfail(strict=True, reason="starts of curriculum=False leave out the nearer half of the range")
 def test_without_a_curriculum_pushes_go_over_the_whole_range():
     task = AnymalPush(curriculum=False)
     distance = reach(task.sample_initial_state(2000, generator()))
