@@ -20,6 +20,7 @@ from torch import Tensor
 
 from tasks.base import Edit, Entry, Task, register
 from tasks.curriculum import Averages, next_level
+from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation
 from torchrl_sym.representations import invariant, polar, quaternion
@@ -158,7 +159,7 @@ class TrifingerRepose(Task):
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """All goals; the first level, or with ``curriculum=False`` the last."""
         level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
-        return self._turned(self._start(level, generator), generator)
+        return self.mapped_at_random(self._start(level, generator), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: the next one reaches farther out after success, less far after failure."""
@@ -171,11 +172,7 @@ class TrifingerRepose(Task):
             return self.sample_initial_state(len(finished), generator)
         failure = whole & ~success & (error > FAILURE_DISTANCE)
         level = next_level(level, success, failure, LAST_LEVEL, generator)
-        return self._turned(self._start(level, generator), generator)
-
-    def _turned(self, state: State, generator: torch.Generator | None) -> State:
-        element = torch.randint(self.robot.group.order, (len(state),), generator=generator)
-        return self.transform_state(state, element)
+        return self.mapped_at_random(self._start(level, generator), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None) -> State:
         n = len(level)
@@ -299,7 +296,7 @@ class TrifingerRepose(Task):
         if self.difficulty < 4:  # without an orientation, all corners are off by the same
             return self.position_error(state)[:, None]
         assert state.mocap_pos is not None and state.mocap_quat is not None
-        turn = _matrix(state.qpos[:, 12:16]) - _matrix(state.mocap_quat[:, 0])
+        turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_quat[:, 0])
         offset = state.qpos[:, 9:12] - state.mocap_pos[:, 0]
         return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
 
@@ -348,17 +345,6 @@ class TrifingerRepose(Task):
 def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:
     """Uniform over a disc, or a sector of it, ``(n, 2)``."""
     return (radius * u.sqrt())[:, None] * torch.stack([bearing.cos(), bearing.sin()], dim=-1)
-
-
-def _matrix(quaternion: Tensor) -> Tensor:
-    """Rotation matrices, ``(n, 3, 3)``, of unit quaternions (w, x, y, z)."""
-    w, x, y, z = quaternion.unbind(-1)
-    rows = (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
 def _edit(timestep: float, weak_finger: int | None) -> Edit:
