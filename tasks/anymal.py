@@ -9,10 +9,13 @@ No term of a reward prefers a direction, a leg or a sign: all are norms, or even
 
 from __future__ import annotations
 
+import math
+
+import mujoco
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task
+from tasks.base import Edit, Entry, Task, check_range
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation
@@ -76,13 +79,13 @@ class Anymal(Task):
     ) -> None:
         if weak_leg is not None and weak_leg not in LEGS:
             raise ValueError(f"weak_leg: expected one of {list(LEGS)}, got {weak_leg!r}")
-        if payload < 0 or (friction is not None and not 0 < friction[0] <= friction[1]):
-            raise ValueError(
-                f"expected a payload >= 0 kg and a rising, positive range of friction, got {payload} and "
-                f"{friction}"
-            )
+        if not 0 <= payload < math.inf:
+            raise ValueError(f"payload: expected a mass >= 0 kg, got {payload}")
+        check_range("friction", friction, above=0.0)
         edit = _edit(physics_timestep, payload, payload_position, weak_leg)
         super().__init__(PointGroup.klein_four(), episode_seconds=episode_seconds, edit=edit)
+        self._mass = float(self.model.body("base").mass[0])
+        check_range("added_mass", added_mass, above=-self._mass)
         self.friction, self.added_mass = friction, added_mass
         self._pose = torch.tensor(DEFAULT_POSE, dtype=torch.float64)
         self._side_x = torch.tensor(_SIDE_X, dtype=torch.float64)
@@ -239,7 +242,7 @@ class Anymal(Task):
             low, high = self.added_mass
             draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
             body = self.model.body("base").id
-            simulation.expand("body_mass")[ids, body] = float(self.model.body_mass[body]) + draw
+            simulation.expand("body_mass")[ids, body] = self._mass + draw
             simulation.refresh(ids)
 
 
@@ -258,7 +261,10 @@ def _edit(timestep: float, payload: float, position: tuple[float, ...], weak_leg
         spec.option.timestep = timestep
         if payload > 0:
             body = spec.body("base").add_body(name="payload", pos=list(position))
-            body.add_geom(name="payload", size=[0.08, 0, 0], mass=payload, contype=0, conaffinity=0)
+            sphere = mujoco.mjtGeom.mjGEOM_SPHERE  # pyright: ignore[reportAttributeAccessIssue]
+            body.add_geom(
+                name="payload", type=sphere, size=[0.08, 0, 0], mass=payload, contype=0, conaffinity=0
+            )
         if weak_leg is not None:
             for joint in ("HAA", "HFE", "KFE"):
                 spec.actuator(f"{weak_leg}_{joint}").forcerange = [-40.0, 40.0]

@@ -83,7 +83,7 @@ class AnymalClimb(Anymal):
     def __init__(
         self, *, height: float = 0.2, phase: Phase = "A", curriculum: bool = True, **robot: Any
     ) -> None:
-        if phase not in ("A", "B", "C") or height < LOWEST_BOX:
+        if phase not in ("A", "B", "C") or not LOWEST_BOX <= height < math.inf:
             raise ValueError(
                 f"expected phase 'A', 'B' or 'C' and a height of at least {LOWEST_BOX} m, got {phase!r} "
                 f"and {height}"

@@ -109,16 +109,17 @@ class Task(abc.ABC):
     ) -> None:
         if episode_seconds is not None:
             self.episode_seconds = float(episode_seconds)
-        if not self.episode_seconds >= self.control_timestep:
+        if not self.control_timestep <= self.episode_seconds < math.inf:
             raise ValueError(
-                "expected episode_seconds of at least one control step "
+                "expected finite episode_seconds of at least one control step "
                 f"({self.control_timestep} s), got {self.episode_seconds}"
             )
         self.model = load_model(self.asset, edit)
-        if not math.isclose(self.substeps * self.model.opt.timestep, self.control_timestep):
+        timestep = self.model.opt.timestep
+        if timestep <= 0 or not math.isclose(self.substeps * timestep, self.control_timestep):
             raise ValueError(
                 f"expected a control_timestep that is a multiple of the model's timestep "
-                f"{self.model.opt.timestep} s, got {self.control_timestep} s; change one of the two"
+                f"{timestep} s, got {self.control_timestep} s; change one of the two"
             )
         self.robot = derive(self.model, group, carried=self.carried)
         parts = [entry.representation for entry in self.layout()]
@@ -257,6 +258,16 @@ class Task(abc.ABC):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:  # noqa: B027
         """Continue from :meth:`state_dict`."""
+
+
+def check_range(name: str, span: tuple[float, float] | None, above: float) -> None:
+    """Refuse a range of random draws that is not rising, not finite or not above a bound.
+
+    Raises:
+        ValueError: names the argument.
+    """
+    if span is not None and not above < span[0] <= span[1] < math.inf:
+        raise ValueError(f"{name}: expected a rising range above {above:g}, got {span}")
 
 
 def load_model(asset: str, edit: Edit | None = None) -> Any:

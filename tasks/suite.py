@@ -9,8 +9,10 @@ speaks dm_env.
 from __future__ import annotations
 
 import collections
+import copy
 from typing import Any
 
+import mujoco as engine
 import numpy as np
 import torch
 from dm_control import mujoco
@@ -21,6 +23,22 @@ from torch import Tensor
 
 from tasks.base import Task, create
 from tasks.state import State
+
+
+class OneSimulation:
+    """The model of one simulation, written to as if it were a batch of one (`Simulation.expand`)."""
+
+    def __init__(self, model: Any) -> None:
+        self._model = model
+
+    def expand(self, name: str) -> Tensor:
+        """Live values of a model field, ``(1, ...)``."""
+        return torch.from_numpy(getattr(self._model, name))[None]
+
+    def refresh(self, ids: Tensor | None = None) -> None:
+        """Recompute the constants that MuJoCo derives from written fields."""
+        mj: Any = engine
+        mj.mj_setConst(self._model, mj.MjData(self._model))
 
 
 class SuiteTask(control.Task):
@@ -60,6 +78,8 @@ class SuiteTask(control.Task):
             start = self.description.sample_initial_state(1, self._generator)
         else:
             start = self.description.restart(self._state, self._generator)
+        one: Any = OneSimulation(physics.model.ptr)  # all that `randomize` needs of a Simulation
+        self.description.randomize(one, torch.zeros(1, dtype=torch.int64), self._generator)
         self._state = start.clone()
         self._fresh = True
         physics.data.time = float(start.time)
@@ -135,7 +155,8 @@ def load(
         ((3,), 0.02)
     """
     description = create(name, **task_kwargs)
-    physics = mujoco.Physics.from_model(wrapper.MjModel(description.model))
+    # A copy: the model's fields are drawn anew for every episode of a randomised task.
+    physics = mujoco.Physics.from_model(wrapper.MjModel(copy.copy(description.model)))
     return control.Environment(
         physics,
         SuiteTask(description, random),

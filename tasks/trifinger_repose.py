@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, register
+from tasks.base import Edit, Entry, Task, check_range, register
 from tasks.curriculum import Averages, next_level
 from tasks.rotations import matrix_of
 from tasks.state import State
@@ -113,9 +113,8 @@ class TrifingerRepose(Task):
                 f"expected a radius in (0, {ARENA}] m and a weak_finger among 0, 1, 2 or None, got "
                 f"{radius} and {weak_finger!r}"
             )
-        for what, span in {"cube_mass": cube_mass, "friction": friction}.items():
-            if span is not None and not 0 < span[0] <= span[1]:
-                raise ValueError(f"{what}: expected a rising, positive range, got {span}")
+        check_range("cube_mass", cube_mass, above=0.0)
+        check_range("friction", friction, above=0.0)
         self.difficulty, self.radius = difficulty, radius
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
         edit = _edit(physics_timestep, weak_finger)

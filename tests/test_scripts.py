@@ -52,9 +52,10 @@ def test_own_environment_tells_right_from_wrong():
 
 
 def test_train_and_continue(tmp_path):
-    first = run("examples/train.py", "--folder", tmp_path, *TINY)
+    few = ["--episodes", "4"]
+    first = run("examples/train.py", "cartpole", "--folder", tmp_path, *TINY, *few)
     assert re.search(r"mean return -\d", first)
-    run("examples/train.py", "--folder", tmp_path, *TINY[2:], "--config.iterations", "3")
+    run("examples/train.py", "cartpole", "--folder", tmp_path, *TINY[2:], "--config.iterations", "3", *few)
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 4
     film = tmp_path / "policy.gif"
     watch = ["--checkpoint", tmp_path, "--stochastic", "--seconds", "0.1", "--width", "64", "--out", film]
@@ -70,6 +71,31 @@ def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     assert picture.stat().st_size > 10_000
 
 
+def test_learn_evaluates_and_draws_a_robot_task(tmp_path):
+    tiny = ["--iterations", "2", "--num-envs", "8", "--episodes", "1"]
+    folders = ["--folder", tmp_path / "runs", "--output", tmp_path / "results"]
+    run("benchmarks/learn.py", "anymal_climb", *tiny, *folders)
+    results = tmp_path / "results" / "anymal_climb"
+    figures = json.loads((results / "result.json").read_text())
+    assert set(figures["evaluation"]) == {"facing the box", "any heading"}
+    goals = figures["evaluation"]["any heading"]["sampled"]["goal_successes"]
+    assert list(goals) == ["front left", "back left", "front right", "back right"]
+    (results / "curve.png").unlink()
+    run("benchmarks/learn.py", "anymal_climb", "--plot", *folders)
+    assert (results / "curve.png").stat().st_size > 10_000
+    policy = [
+        "--checkpoint",
+        results,
+        "--seconds",
+        "0.04",
+        "--width",
+        "64",
+        "--out",
+        tmp_path / "policy.png",
+    ]
+    run("examples/watch.py", "anymal_climb", *policy)
+
+
 @pytest.mark.parametrize("suffix", ["png", "gif"])
 def test_watch_draws_every_goal(tmp_path, suffix):
     picture = tmp_path / f"watch.{suffix}"
@@ -82,8 +108,8 @@ def test_watch_draws_every_goal(tmp_path, suffix):
 
 def test_watch_draws_paths_from_above(tmp_path):
     picture = tmp_path / "paths.png"
-    settings = ["--goals", "front left", "hind right", "--seconds", "0.1", "--overlay", "--out", picture]
-    assert "front left, hind right" in run("examples/watch.py", "anymal_push", *settings)
+    settings = ["--goals", "front left", "back right", "--seconds", "0.1", "--overlay", "--out", picture]
+    assert "front left, back right" in run("examples/watch.py", "anymal_push", *settings)
     assert picture.stat().st_size > 10_000
 
 

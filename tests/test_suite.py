@@ -114,6 +114,33 @@ def test_in_torchrl(name):
 
 
 @all_tasks
-def test_physics_runs_on_the_same_model(name):
+def test_physics_runs_on_a_copy_of_the_model(name):
+    """A copy, since a randomised task writes into it."""
     env = tasks.load(name)
-    assert env.physics.model.ptr is env.task.description.model
+    one, other = env.physics.model.ptr, env.task.description.model
+    assert one is not other
+    for field in ("body_mass", "geom_friction", "jnt_axis", "actuator_gainprm", "qpos0"):
+        np.testing.assert_array_equal(getattr(one, field), getattr(other, field))
+    assert one.opt.timestep == other.opt.timestep
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "field"),
+    [
+        ("anymal_push", {"friction": (0.5, 2.0)}, "geom_friction"),
+        ("anymal_climb", {"added_mass": (-2.0, 2.0)}, "body_mass"),
+        ("trifinger_repose", {"cube_mass": (0.05, 0.1)}, "body_inertia"),
+    ],
+)
+def test_randomises_every_episode(name, kwargs, field):
+    env = tasks.load(name, random=0, **kwargs)
+    model, nominal = env.physics.model.ptr, env.task.description.model
+    drawn = []
+    for _ in range(3):
+        env.reset()
+        drawn.append(getattr(model, field).copy())
+    assert not np.array_equal(drawn[0], drawn[1]) and not np.array_equal(drawn[1], drawn[2])
+    own = getattr(nominal, field)  # the description's, which nothing writes into
+    assert not np.array_equal(drawn[0], own)
+    ratio = drawn[2][own > 0] / own[own > 0]
+    assert ratio.min() > 0.4 and ratio.max() < 2.1, "draws must not compound"
