@@ -9,6 +9,7 @@ policy is evaluated in steps of 0.005 s whatever it was trained in, with its mea
 ones, on as many episodes for every equivalent goal.
 """
 
+import csv
 import dataclasses
 import functools
 import json
@@ -64,36 +65,39 @@ def main(arguments: Arguments) -> None:
     output = arguments.output / arguments.task
     if not arguments.plot:
         setting = chosen(arguments)
-        folder = arguments.folder / arguments.task
-        make_env = functools.partial(tasks.make_env, arguments.task, num_threads=1, **setting.task)
-        symmetry = make_env(num_envs=1).symmetry
-        for _ in train(setting.config, make_env, symmetry, folder=folder, progress=True):
-            pass
-        report(arguments, setting, folder, output)
+        folders: list[Path] = []
+        for stage in (setting, *setting.then):
+            folder = arguments.folder / arguments.task / f"stage_{len(folders)}"
+            make_env = functools.partial(tasks.make_env, arguments.task, num_threads=1, **stage.task)
+            where = {"folder": folder, "start_from": folders[-1] if folders else None}
+            for _ in train(stage.config, make_env, make_env(num_envs=1).symmetry, progress=True, **where):
+                pass
+            folders.append(folder)
+        report(arguments, setting, folders, output)
     draw(output)
     print(f"written to {output}")
 
 
 def chosen(arguments: Arguments) -> Setting:
     """The task's setting with what the command line replaces."""
-    setting = SETTINGS[arguments.task]
-    changes = {
-        name: getattr(arguments, name)
-        for name in ("iterations", "num_envs", "augmentation", "seed")
-        if getattr(arguments, name) is not None
-    }
-    return dataclasses.replace(setting, config=dataclasses.replace(setting.config, **changes))
+    names = ("iterations", "num_envs", "augmentation", "seed")
+    changes = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
+
+    def changed(setting: Setting) -> Setting:
+        config = dataclasses.replace(setting.config, **changes)
+        return dataclasses.replace(setting, config=config, then=tuple(map(changed, setting.then)))
+
+    return changed(SETTINGS[arguments.task])
 
 
-def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -> None:
+def report(arguments: Arguments, setting: Setting, folders: list[Path], output: Path) -> None:
     """Evaluate the last policy, and write everything that the pictures need."""
-    export_actor(folder, output)
-    (output / "metrics.csv").write_bytes((folder / "metrics.csv").read_bytes())
-    last = read_metrics(output / "metrics.csv")[-1]
+    export_actor(folders[-1], output)
+    last = join([read_metrics(folder / "metrics.csv") for folder in folders], output / "metrics.csv")
+    stages = (setting, *setting.then)
     result = {
         "command": "python " + " ".join(sys.argv),
-        "config": dataclasses.asdict(setting.config),
-        "training_task": setting.task,
+        "stages": [{"config": dataclasses.asdict(s.config), "task": s.task} for s in stages],
         "frames": last["frames"],
         "minutes": last["seconds"] / 60,
         "machine": f"{platform.machine()}, one process, one thread",
@@ -108,6 +112,19 @@ def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -
         for what, kwargs in setting.evaluations.items()
     }
     (output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
+
+
+def join(stages: list[list[dict[str, float]]], path: Path) -> dict[str, float]:
+    """Write the tables of all stages as one, with frames and seconds that go on; returns the last row."""
+    before = {"frames": 0.0, "seconds": 0.0}
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, fieldnames=["stage", *stages[0][0]])
+        writer.writeheader()
+        for number, rows in enumerate(stages):
+            rows = [{"stage": number, **row, **{k: row[k] + before[k] for k in before}} for row in rows]
+            writer.writerows(rows)
+            before = {key: rows[-1][key] for key in before}
+    return before
 
 
 def evaluation(arguments: Arguments, output: Path, task: dict[str, Any]) -> dict[str, Any]:

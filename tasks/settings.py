@@ -21,11 +21,13 @@ class Setting:
         config: hyper-parameters of :func:`torchrl_sym.recipes.train`.
         task: arguments of the task in training.
         evaluations: arguments of the task in evaluation, by what is evaluated.
+        then: settings to train on with, each from the last state of the one before it.
     """
 
     config: PPOConfig
     task: dict[str, Any] = field(default_factory=dict)
     evaluations: dict[str, dict[str, Any]] = field(default_factory=lambda: {"task": {}})
+    then: tuple[Setting, ...] = ()
 
 
 # An action of 1 moves a target by 2 rad, a walking robot's by some 0.5 rad: networks put out quarters, and

@@ -79,6 +79,26 @@ def test_interrupted_run_continues_exactly(symmetry, tmp_path):
     assert_same_parts(tmp_path / "whole", tmp_path / "cut")
 
 
+def test_a_run_starts_from_another_one(symmetry, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    list(train(TINY, MAKE_ENV, symmetry, folder=first))
+    frozen = dataclasses.replace(
+        TINY, iterations=2, entropy_coeff=0.1, desired_kl=None, max_grad_norm=1e-12
+    )
+    rows = list(train(frozen, MAKE_ENV, symmetry, folder=second, start_from=first))
+    assert [row["iteration"] for row in rows] == [1, 2]
+    old, new = (RunFolder(folder).load() for folder in (first, second))
+    drift = [(new["parts"]["actor"][k] - x).abs().max() for k, x in old["parts"]["actor"].items()]
+    fresh = dict(make_networks(TINY, MAKE_ENV(num_envs=1), symmetry)[0].state_dict())
+    reset = [(fresh[k] - x).abs().max() for k, x in old["parts"]["actor"].items()]
+    assert max(drift) < 0.1 * max(reset)
+    # Interrupted, it goes on from its own checkpoint.
+    longer = dataclasses.replace(frozen, iterations=3)
+    assert len(list(train(longer, MAKE_ENV, symmetry, folder=second, start_from=first))) == 1
+    with pytest.raises(FileNotFoundError, match=r"to start from, found \[\]"):
+        list(train(TINY, MAKE_ENV, symmetry, start_from=tmp_path / "nothing"))
+
+
 SCRIPT = """
 import functools, sys, torch
 torch.set_num_threads(1)

@@ -54,6 +54,11 @@ class PPOConfig:
     desired_kl: float | None = 0.01
     """Policy change per update that the learning rate is adapted to (rsl_rl's rule: divided by 1.5
     above twice this value, multiplied by 1.5 below half of it). None keeps it constant."""
+    adapt_every: Literal["minibatch", "iteration"] = "minibatch"
+    """How often the learning rate is adapted. After every minibatch, as in rsl_rl, it climbs by 1.5 per
+    minibatch as long as the policy is near the one that collected the data, and falls as fast afterwards:
+    with 20 minibatches most steps are tiny and a few are far too large. After every iteration (by the KL
+    of the last epoch) it settles."""
     min_learning_rate: float = 1e-5
     """Lower end of the adaptive learning rate."""
     max_learning_rate: float = 1e-2
@@ -90,6 +95,8 @@ class PPOConfig:
         choices = ("none", "all", "random", "naive")
         if self.augmentation not in choices:
             raise ValueError(f"augmentation: expected one of {choices}, got {self.augmentation!r}")
+        if self.adapt_every not in ("minibatch", "iteration"):
+            raise ValueError(f"adapt_every: expected minibatch or iteration, got {self.adapt_every!r}")
         counts = ("iterations", "num_envs", "horizon", "epochs", "minibatches", "checkpoint_interval")
         for name in counts:
             value = getattr(self, name)

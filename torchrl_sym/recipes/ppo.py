@@ -49,6 +49,7 @@ def train(
     symmetry: Symmetry,
     *,
     folder: str | os.PathLike | None = None,
+    start_from: str | os.PathLike | None = None,
     logger: str | None = "csv",
     progress: bool = False,
 ) -> Iterator[dict[str, float]]:
@@ -66,6 +67,10 @@ def train(
         symmetry: what transforms how. Its observation keys are what actor and critic read. Also used,
             as a metric, when nothing is augmented.
         folder: where metrics and checkpoints go; nothing is written by default.
+        start_from: folder of another run, whose networks, optimizer (with its learning rate), running
+            episodes and curriculum a new run begins with: to train on with other hyper-parameters, or in
+            another version of the task. Its networks and number of environments must be those of
+            ``config``.
         logger: ``"csv"`` (metrics.csv only), or also ``"tensorboard"`` or ``"wandb"``.
         progress: show a progress bar.
 
@@ -79,6 +84,7 @@ def train(
         ValueError: the folder holds a run with another configuration.
         KeyError, ValueError: the environment and the symmetry do not fit.
         TypeError: the action is not continuous.
+        FileNotFoundError: there is no checkpoint to start from.
         FloatingPointError: a loss is not finite; the last checkpoint is still good.
 
     Example:
@@ -110,7 +116,8 @@ def train(
     episodes = Episodes(env)
     run = None if folder is None else RunFolder(folder)
     parts = {"actor": actor, "critic": critic, "optimizer": optimizer}
-    start, elapsed = resume(run, config, env, parts, episodes)
+    earlier = None if start_from is None else RunFolder(start_from)
+    start, elapsed = resume(run, config, env, parts, episodes, earlier)
     if start >= config.iterations:
         env.close()
         return
@@ -270,7 +277,8 @@ def _learn(
     """Some epochs of minibatch updates; returns the mean of every reported quantity."""
     sums: dict[str, Tensor] = {}
     updates = config.epochs * config.minibatches
-    for _ in range(config.epochs):
+    last = torch.zeros(())
+    for epoch in range(config.epochs):
         for minibatch in buffer:
             out = {key: value for loss in losses for key, value in loss(minibatch).items()}
             total = torch.stack([value for key, value in out.items() if key.startswith("loss_")]).sum()
@@ -286,11 +294,15 @@ def _learn(
             optimizer.step()
             # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
             out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
-            if schedule is not None:
+            if schedule is not None and config.adapt_every == "minibatch":
                 schedule.step(out["kl"])
+            if epoch == config.epochs - 1:
+                last = last + out["kl"].detach() / config.minibatches
             for key, value in out.items():
                 if value.numel() == 1:
                     sums[key] = sums.get(key, 0.0) + value.detach()
+    if schedule is not None and config.adapt_every == "iteration":
+        schedule.step(last)
     metrics = {key: float(value) / updates for key, value in sums.items()}
     return metrics | {"learning_rate": optimizer.param_groups[0]["lr"]}
 

@@ -37,14 +37,22 @@ def snapshot(
 
 
 def resume(
-    run: RunFolder | None, config: PPOConfig, env: EnvBase, parts: dict[str, Any], episodes: Episodes
+    run: RunFolder | None,
+    config: PPOConfig,
+    env: EnvBase,
+    parts: dict[str, Any],
+    episodes: Episodes,
+    start_from: RunFolder | None = None,
 ) -> tuple[int, float]:
     """Load the folder's checkpoint, or begin; returns the iterations done and the seconds they took."""
     checkpoint = None if run is None else run.load()
     if run is None or checkpoint is None:
         if run is not None:
             run.truncate(0)  # a row that was logged before the first checkpoint
-        call_env(env, "stagger")
+        if start_from is None:
+            call_env(env, "stagger")
+        else:
+            _begin_from(start_from, env, parts)
         return 0, 0.0
     differences = config.differences(checkpoint["config"])
     if differences:
@@ -61,6 +69,20 @@ def resume(
         torch.cuda.set_rng_state_all(checkpoint["cuda_rng"])
     run.truncate(checkpoint["iteration"])
     return checkpoint["iteration"], checkpoint["seconds"]
+
+
+def _begin_from(earlier: RunFolder, env: EnvBase, parts: dict[str, Any]) -> None:
+    """Networks, optimizer, episodes and curriculum of another run, whatever its hyper-parameters."""
+    checkpoint = earlier.load()
+    found = [] if checkpoint is None else list(checkpoint["parts"])
+    if checkpoint is None or set(parts) - set(found):
+        raise FileNotFoundError(
+            f"expected a checkpoint with {list(parts)} in {earlier.path} to start from, found {found}; "
+            "train there first"
+        )
+    for name, part in parts.items():
+        part.load_state_dict(checkpoint["parts"][name])
+    _restore_env(env, checkpoint, finished=False)
 
 
 def _restore_env(env: EnvBase, checkpoint: dict[str, Any], *, finished: bool) -> None:
