@@ -13,6 +13,7 @@ import csv
 import dataclasses
 import functools
 import json
+import math
 import platform
 import subprocess
 import sys
@@ -75,6 +76,7 @@ def main(arguments: Arguments) -> None:
             folders.append(folder)
         report(arguments, setting, folders, output)
     draw(output)
+    (arguments.output / "README.md").write_text(table(arguments.output))
     print(f"written to {output}")
 
 
@@ -115,16 +117,44 @@ def report(arguments: Arguments, setting: Setting, folders: list[Path], output: 
 
 
 def join(stages: list[list[dict[str, float]]], path: Path) -> dict[str, float]:
-    """Write the tables of all stages as one, with frames and seconds that go on; returns the last row."""
-    before = {"frames": 0.0, "seconds": 0.0}
+    """Write the tables of all stages as one of some 500 rows; returns the frames and seconds in all."""
+    total = {"frames": 0.0, "seconds": 0.0}
+    whole = []
+    for number, rows in enumerate(stages):
+        whole += [{"stage": number, **row, **{key: row[key] + total[key] for key in total}} for row in rows]
+        total = {key: whole[-1][key] for key in total}
+    every = math.ceil(len(whole) / 500)
     with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, fieldnames=["stage", *stages[0][0]])
+        writer = csv.DictWriter(file, fieldnames=list(whole[0]))
         writer.writeheader()
-        for number, rows in enumerate(stages):
-            rows = [{"stage": number, **row, **{k: row[k] + before[k] for k in before}} for row in rows]
-            writer.writerows(rows)
-            before = {key: rows[-1][key] for key in before}
-    return before
+        for row in whole[::-every][::-1]:  # the last row is kept
+            exact = ("stage", "iteration", "frames")
+            writer.writerow({k: int(v) if k in exact else f"{v:.5g}" for k, v in row.items()})
+    return total
+
+
+def table(folder: Path) -> str:
+    """What every task reached, as Markdown, from the stored results alone."""
+    head = ["task", "what", "million steps", "minutes", "actions", "success", "worst goal", "best goal"]
+    head += ["return", "variation"]
+    lines = [head, ["---"] * len(head)]
+    for path in sorted(folder.glob("*/result.json")):
+        result = json.loads(path.read_text())
+        for what, evaluation in result["evaluation"].items():
+            for actions in ("deterministic", "sampled"):
+                figures = evaluation[actions]
+                rates = [f"{rate:.1%}" for rate in sorted(figures["goal_successes"].values())] or ["-"]
+                success = "-" if figures["success"] is None else f"{figures['success']:.1%}"
+                cells = [
+                    path.parent.name,
+                    what,
+                    f"{result['frames'] / 1e6:.1f}",
+                    f"{result['minutes']:.0f}",
+                ]
+                cells += [actions, success, rates[0], rates[-1]]
+                lines.append([*cells, f"{figures['return']:.2f}", f"{figures['variation']:.2f}"])
+    text = "Made by `python benchmarks/learn.py TASK`; one seed each, see `result.json` of every task.\n\n"
+    return text + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
 def evaluation(arguments: Arguments, output: Path, task: dict[str, Any]) -> dict[str, Any]:

@@ -51,7 +51,8 @@ class Anymal(Task):
 
     Args:
         episode_seconds: length of an episode, s; None for the task's own.
-        physics_timestep: 0.005 s; 0.01 s simulates 1.65 times as fast and was good enough to train in.
+        physics_timestep: 0.005 s; 0.01 s simulates 1.6 times as fast, good enough for most of a training,
+            but its contacts are softer: finish in 0.005 s.
         friction: range of a factor on all sliding friction, drawn per episode; None keeps the model's.
         added_mass: range of the mass added to the base, kg, drawn per episode; None adds none.
         payload: mass in kg fixed on top of the base at ``payload_position``, for studies of asymmetry.

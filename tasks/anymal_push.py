@@ -31,9 +31,11 @@ STOP_DISTANCE = 0.12
 # The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, by this much,
 # m, plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the
 # line is asked to get behind the cube before it pushes on. Near the target the speed falls in proportion to
-# the distance left, to a third: a cube that is pushed past its target is hard to get back.
+# the distance left, to a third: a cube that is pushed past its target is hard to get back. The tolerance of
+# the velocity's reward falls with it: otherwise standing still short of the target would pay nearly as well.
 SPEED, BEHIND, DETOUR = 0.6, 0.3, 0.6
 SLOW_DISTANCE, SLOWEST = 0.5, 0.2
+TOLERANCE = 0.8  # of the speed asked for: standing still earns a fifth
 BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
 FALL_PENALTY = 5.0
 # Weights of the reward's terms. The first group is the task; the others ask for a gait that lasts.
@@ -168,19 +170,20 @@ class AnymalPush(Anymal):
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Approach the cube from behind, move it to the target, hold it there; walk well."""
         distance, gap = self._distance(state), self._gap(state)
+        velocity, turning, turn = state.qvel[:, 0:3], state.qvel[:, 3:6], rotation(state)
         pushing = distance > STOP_DISTANCE
         ahead = gap / distance.clamp(min=1e-6)[:, None]
         to_cube = state.qpos[:, 19:21] - state.qpos[:, 0:2]
         aside = (to_cube[:, 0] * ahead[:, 1] - to_cube[:, 1] * ahead[:, 0]).abs().clamp(max=DETOUR)
         to_point = to_cube - (BEHIND + aside)[:, None] * ahead
-        speed = (SPEED * distance / SLOW_DISTANCE).clamp(SLOWEST, SPEED) * pushing
-        asked = to_point * (speed / to_point.norm(dim=-1).clamp(min=1e-6))[:, None]
-        velocity, turning, turn = state.qvel[:, 0:3], state.qvel[:, 3:6], rotation(state)
+        speed = (SPEED * distance / SLOW_DISTANCE).clamp(SLOWEST, SPEED)
+        asked = to_point * (speed * pushing / to_point.norm(dim=-1).clamp(min=1e-6))[:, None]
+        miss = (velocity[:, :2] - asked).square().sum(-1) / (TOLERANCE * speed).square()
         progress = (state.variables["distance"][:, 0] - distance) / self.control_timestep
         terms = {
-            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp(),
+            "velocity": (-miss).exp(),
             "progress": progress.clamp(-1.5, 1.5),
-            "tracking": 1 / (1 + (distance / 0.25).square()),
+            "tracking": 1 / (1 + (distance / 0.15).square()),
             "alive": torch.ones_like(distance),
             "height": (state.qpos[:, 2] - BASE_HEIGHT).square(),
             "vertical": velocity[:, 2].square(),

@@ -79,6 +79,25 @@ def test_interrupted_run_continues_exactly(symmetry, tmp_path):
     assert_same_parts(tmp_path / "whole", tmp_path / "cut")
 
 
+def test_a_field_added_later_counts_as_its_default():
+    stored = dataclasses.asdict(TINY)
+    del stored["adapt_every"]
+    assert TINY.differences(stored) == {}
+    changed = dataclasses.replace(TINY, adapt_every="iteration")
+    assert changed.differences(stored) == {"adapt_every": ("minibatch", "iteration")}
+
+
+def test_learning_rate_adapted_once_per_iteration(symmetry):
+    config = dataclasses.replace(TINY, desired_kl=1e-9, learning_rate=1e-3)
+    slow = [
+        row["learning_rate"]
+        for row in train(dataclasses.replace(config, adapt_every="iteration"), MAKE_ENV, symmetry)
+    ]
+    assert slow == pytest.approx([1e-3 / 1.5**k for k in (1, 2, 3, 4)])
+    fast = [row["learning_rate"] for row in train(config, MAKE_ENV, symmetry)]
+    assert fast[0] < slow[0] / 1.5
+
+
 def test_a_run_starts_from_another_one(symmetry, tmp_path):
     first, second = tmp_path / "first", tmp_path / "second"
     list(train(TINY, MAKE_ENV, symmetry, folder=first))

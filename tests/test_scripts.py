@@ -83,6 +83,7 @@ def test_learn_evaluates_and_draws_a_robot_task(tmp_path):
     (results / "curve.png").unlink()
     run("benchmarks/learn.py", "anymal_climb", "--plot", *folders)
     assert (results / "curve.png").stat().st_size > 10_000
+    assert "| anymal_climb | any heading |" in (tmp_path / "results" / "README.md").read_text()
     policy = [
         "--checkpoint",
         results,

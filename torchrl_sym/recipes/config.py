@@ -131,10 +131,12 @@ class PPOConfig:
     def differences(self, other: dict) -> dict[str, tuple]:
         """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
 
-        Iterations, checkpoint interval and device may change when a run is continued.
+        Iterations, checkpoint interval and device may change when a run is continued. A field that was
+        added after the configuration was stored counts as having had its default.
         """
         mine = dataclasses.asdict(self)
         free = {"iterations", "checkpoint_interval", "device"}
+        other = {field.name: field.default for field in dataclasses.fields(self)} | other
         return {
             name: (other.get(name), value)
             for name, value in mine.items()
