@@ -32,7 +32,7 @@ STOP_DISTANCE = 0.12
 # m, plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the
 # line is asked to get behind the cube before it pushes on. Near the target the speed falls in proportion to
 # the distance left, to a third: a cube that is pushed past its target is hard to get back. The tolerance of
-# the velocity's reward falls with it: otherwise standing still short of the target would pay nearly as well.
+# the velocity's reward falls with it, or standing still short of the target would pay nearly as well.
 SPEED, BEHIND, DETOUR = 0.6, 0.3, 0.6
 SLOW_DISTANCE, SLOWEST = 0.5, 0.2
 TOLERANCE = 0.8  # of the speed asked for: standing still earns a fifth
@@ -48,7 +48,7 @@ EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.00
 
 @register
 class AnymalPush(Anymal):
-    """Push a cube of 0.6 m and 5 kg to a target 0.3 to 1.35 m away.
+    """Push a cube of 0.6 m and 8 kg to a target 0.3 to 1.35 m away.
 
     Group: Klein four. Observation: 45 proprioceptive numbers, cube and target position in the base frame.
     An episode succeeds if the cube ends within 0.2 m of the target.
@@ -182,7 +182,7 @@ class AnymalPush(Anymal):
         progress = (state.variables["distance"][:, 0] - distance) / self.control_timestep
         terms = {
             "velocity": (-miss).exp(),
-            "progress": progress.clamp(-1.5, 1.5),
+            "progress": progress.clamp(-1.5, SPEED),  # no more for a kick than for a push
             "tracking": 1 / (1 + (distance / 0.15).square()),
             "alive": torch.ones_like(distance),
             "height": (state.qpos[:, 2] - BASE_HEIGHT).square(),

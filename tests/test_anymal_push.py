@@ -15,6 +15,7 @@ from tasks.anymal_push import (
     SPEED,
     STOP_DISTANCE,
     TASK_WEIGHTS,
+    TOLERANCE,
     AnymalPush,
 )
 from tasks.environment import BatchedEnv
@@ -72,7 +73,8 @@ def test_reward_by_hand():
     state.variables["distance"][:] = 0.51
     terms = task.reward_terms(state, zeros(state))
     weight = {name: 0.02 * value for name, value in TASK_WEIGHTS.items()}
-    assert terms["velocity"].item() == pytest.approx(weight["velocity"] * math.exp(-0.25))
+    miss = 0.25 / (TOLERANCE * SPEED)
+    assert terms["velocity"].item() == pytest.approx(weight["velocity"] * math.exp(-(miss**2)))
     assert terms["progress"].item() == pytest.approx(weight["progress"] * 0.5)
     assert 0 < terms["tracking"].item() < weight["tracking"]
     for name in ("height", "vertical", "rolling", "tilt", "fall"):
@@ -92,12 +94,33 @@ def test_progress_pays_for_the_distance_covered_and_takes_it_back():
     ahead = (target - state.qpos[:, 19:21]) / state.variables["distance"]
     first = state.qpos[:, 19:21].clone()
     for step in range(101):
-        state.qpos[:, 19:21] = first + 0.2 * math.sin(step * math.pi / 50) * ahead
+        state.qpos[:, 19:21] = first + 0.15 * math.sin(step * math.pi / 50) * ahead
         total += float(task.reward_terms(state, zeros(state))["progress"])
         state.variables |= task.update(state, zeros(state))
         if step == 25:
-            assert total == pytest.approx(TASK_WEIGHTS["progress"] * 0.2)
+            assert total == pytest.approx(TASK_WEIGHTS["progress"] * 0.15)
     assert total == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_kick_earns_less_than_a_push_over_the_same_distance():
+    def earned(step):
+        task, state = standing()
+        gap = state.mocap_pos[:, 0, :2] - state.qpos[:, 19:21]
+        state.variables["distance"] = gap.norm(dim=-1, keepdim=True)
+        state.qpos[:, 19:21] += step * gap / gap.norm(dim=-1, keepdim=True)
+        return float(task.reward_terms(state, zeros(state))["progress"])
+
+    assert earned(0.02) < 4 * earned(0.005)
+    assert earned(-0.02) == pytest.approx(-4 * earned(0.005))  # the way back costs in full
+
+
+@pytest.mark.parametrize("distance", [0.2, 0.3, 0.6, 1.3])
+def test_standing_still_short_of_the_target_pays_a_fifth_of_walking(distance):
+    task, state = standing()
+    ray = state.qpos[0, 19:21] / state.qpos[0, 19:21].norm()
+    state.mocap_pos[0, 0, :2] = state.qpos[0, 19:21] + distance * ray
+    still = float(task.reward_terms(state, zeros(state))["velocity"])
+    assert still == pytest.approx(0.02 * TASK_WEIGHTS["velocity"] * math.exp(-(TOLERANCE**-2)))
 
 
 def earned(*plans):
