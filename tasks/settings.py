@@ -53,6 +53,16 @@ _ANYMAL = PPOConfig(
 # Training in steps of 0.01 s is 1.4 times as fast.
 _FAST = {"physics_timestep": 0.01}
 
+# Pushing wants a steady hand: twice the batch, half the policy change, less noise, and a learning rate that
+# settles. (With _ANYMAL and earlier rewards, success rose to 0.6 and fell again as targets moved away.)
+_PUSH = dataclasses.replace(
+    _ANYMAL,
+    iterations=488,  # 12.0 M steps
+    num_envs=1024,
+    entropy_coeff=0.001,
+    desired_kl=0.012,
+    adapt_every="iteration",
+)
 _CLIMB_ON = dataclasses.replace(
     _ANYMAL, iterations=220, entropy_coeff=0.0, desired_kl=0.01, max_learning_rate=1e-3
 )
@@ -80,7 +90,7 @@ _TRIFINGER = PPOConfig(
 
 SETTINGS: dict[str, Setting] = {
     "cartpole": Setting(PPOConfig()),
-    "anymal_push": Setting(dataclasses.replace(_ANYMAL, iterations=976), _FAST),  # 12.0 M steps
+    "anymal_push": Setting(_PUSH, _FAST),
     "anymal_climb": Setting(  # 21.4 M steps
         dataclasses.replace(_ANYMAL, iterations=1740),
         _FAST,
