@@ -153,8 +153,15 @@ def table(folder: Path) -> str:
                 ]
                 cells += [actions, success, rates[0], rates[-1]]
                 lines.append([*cells, f"{figures['return']:.2f}", f"{figures['variation']:.2f}"])
-    text = "Made by `python benchmarks/learn.py TASK`; one seed each, see `result.json` of every task.\n\n"
-    return text + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    text = (
+        "Made by `python benchmarks/learn.py TASK`: one seed each, one process with one thread; settings,\n"
+        "versions and rates of every goal are in `result.json` of each task. Minutes are wall clock, and\n"
+        "the two cores had other jobs as well.\n\n"
+    )
+    text += "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    for path in sorted(folder.glob("*/curve.png")):
+        text += f"\n## {path.parent.name}\n\n![Training curves]({path.parent.name}/curve.png)\n"
+    return text
 
 
 def evaluation(arguments: Arguments, output: Path, task: dict[str, Any]) -> dict[str, Any]:
