@@ -48,6 +48,8 @@ class Arguments:
 
     only: Literal["env", "loss", "augment"] | None = None
     """One of the tables."""
+    tasks: tuple[str, ...] = tasks.ALL_TASKS
+    """Tasks whose environments are timed."""
     rounds: int = 15
     """Timed rounds per row."""
     threads: int = 2
@@ -110,7 +112,7 @@ def measure_envs(arguments: Arguments) -> list[dict]:
     """Env steps per second, resets included, against raw physics and against TorchRL's processes."""
     print(f"\nenvironment steps per second, {arguments.threads} physics threads")
     rows = []
-    for task in tasks.ALL_TASKS:
+    for task in arguments.tasks:
         parallel = parallel_env_rate(task, arguments.rounds)
         for n in arguments.num_envs:
             steps = max(64, 16384 // n)  # long enough that switching variants does not show
