@@ -11,6 +11,7 @@ the median over rounds, a ratio the median of the rounds' ratios. One torch thre
 
 import functools
 import json
+import math
 import platform
 import time
 from collections.abc import Callable
@@ -52,6 +53,8 @@ class Arguments:
     """Tasks whose environments are timed."""
     rounds: int = 15
     """Timed rounds per row."""
+    settle: int = 100
+    """Environment steps before the clock starts."""
     threads: int = 2
     """Physics threads."""
     num_envs: tuple[int, ...] = (64, 512, 2048)
@@ -115,9 +118,12 @@ def measure_envs(arguments: Arguments) -> list[dict]:
     for task in arguments.tasks:
         parallel = parallel_env_rate(task, arguments.rounds)
         for n in arguments.num_envs:
-            steps = max(64, 16384 // n)  # long enough that switching variants does not show
             env = tasks.make_env(task, num_envs=n, num_threads=arguments.threads, seed=0)
+            steps = steps_of_a_round(env)
             variants = {"raw": raw_physics(env, steps, arguments.threads), "env": stepping(env, steps)}
+            for run in variants.values():  # until robots stand: in the air there is little to solve
+                for _ in range(math.ceil(arguments.settle / steps)):
+                    run()
             seconds = interleave(variants, arguments.rounds)
             rate = {name: n * steps / median(values) for name, values in seconds.items()}
             row = {
@@ -132,6 +138,15 @@ def measure_envs(arguments: Arguments) -> list[dict]:
             rows.append(row)
             show(rows)
     return rows
+
+
+def steps_of_a_round(env: EnvBase, seconds: float = 0.4) -> int:
+    """As many steps as take long enough that switching variants does not show."""
+    run = stepping(env, 8)
+    run()
+    start = time.perf_counter()
+    run()
+    return max(8, round(8 * seconds / (time.perf_counter() - start)))
 
 
 def stepping(env: EnvBase, steps: int) -> Callable[[], None]:
@@ -157,9 +172,10 @@ def raw_physics(env: EnvBase, steps: int, threads: int) -> Callable[[], None]:
     ctrl = simulation.bind("ctrl")
     controls = [env.task.control(a, start).double().numpy() for a in small_actions(env, steps)]
 
+    for name, view in views.items():
+        view[:] = fields[name].numpy()
+
     def run() -> None:
-        for name, view in views.items():
-            view[:] = fields[name].numpy()
         for control in controls:
             ctrl[:] = control
             simulation.step(nstep=env.task.substeps)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from tasks.anymal import Anymal, into_base, rotation
+from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
 from tasks.curriculum import Averages, next_level
 from tasks.state import State
@@ -36,6 +36,7 @@ BASE_HEIGHT, LOWEST = 0.5, 0.2  # asked for over the ground, and counted as fall
 FALL_PENALTY = 5.0
 # The grid of the height map: 21 x 11 points, 0.1 m apart, that turn with the robot's heading.
 ROWS, COLUMNS, SPACING = 21, 11, 0.1
+HEIGHT_SCALE = 2.0  # what heights, m, are multiplied by
 # A phase is over at this success rate and, for A, at this mean level.
 PHASE_SUCCESS, PHASE_LEVEL = 0.7, 3.0
 TASK_WEIGHTS = {"position": 10.0, "heading": 2.0}
@@ -92,7 +93,8 @@ class AnymalClimb(Anymal):
         self.height, self.phase, self.curriculum = height, phase, curriculum
         self.averages = Averages("success", "level", "distance")
         self._grid_x, self._grid_y = torch.cartesian_prod(*_axes()).unbind(-1)
-        self._below = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)  # the robot's footprint
+        footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
+        self._below = footprint.nonzero().squeeze(1)
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, command, height map."""
@@ -104,7 +106,7 @@ class AnymalClimb(Anymal):
             Entry("time left", invariant(group, 1), "1", "-", "invariant"),
             Entry(
                 "heights of the ground", height_map(group, *_axes()), "m", "heading",
-                "permutation of the grid's points", 2.0,
+                "permutation of the grid's points", HEIGHT_SCALE,
             ),
         )  # fmt: skip
 
@@ -179,9 +181,10 @@ class AnymalClimb(Anymal):
             cos, sin = ahead.float().unsqueeze(-1).unbind(1)
             box = state.mocap_pos[:, 0]
             offset = (state.qpos[:, 0:2] - box[:, :2]).float()
-            x = torch.addcmul(offset[:, :1] - sin * self._grid_y, cos, self._grid_x).abs_()
-            y = torch.addcmul(offset[:, 1:] + cos * self._grid_y, sin, self._grid_x).abs_()
-            return (torch.maximum(x, y) <= BOX) * (box[:, 2:] + BOX).float()
+            x = torch.addcmul(offset[:, :1], cos, self._grid_x).addcmul_(sin, self._grid_y, value=-1)
+            y = torch.addcmul(offset[:, 1:], sin, self._grid_x).addcmul_(cos, self._grid_y)
+            inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= BOX
+            return torch.mul(inside, (box[:, 2:] + BOX).float(), out=y)
 
         return state.shared("heights", compute)
 
@@ -220,16 +223,18 @@ class AnymalClimb(Anymal):
         observation[:, 45:48] = into_base(rotation(state), self._gap(state))
         observation[:, 48:50] = self._heading_error(state)
         observation[:, 50] = 1 - state.time / self.episode_seconds
+        observation[:, :51].clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
         level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
-        observation[:, 51:] = (self.heights(state) - level).clamp_(-1.0, 1.0) * 2.0
-        return observation.clamp_(-20.0, 20.0)
+        heights = torch.sub(self.heights(state), level, out=observation[:, 51:])
+        heights.clamp_(-1.0, 1.0).mul_(HEIGHT_SCALE)
+        return observation
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Be on the box at the end; in phase A also walk towards it; walk well."""
         gap, velocity, turning = self._gap(state), state.qvel[:, 0:3], state.qvel[:, 3:6]
         distance, turned = self._distance(state), 1 - self._heading_error(state)[:, 0]
         last = (state.time > self.episode_seconds - TASK_SECONDS).double() / TASK_SECONDS
-        ground = self.heights(state)[:, self._below].mean(dim=1).double()
+        ground = self.heights(state).index_select(1, self._below).mean(dim=1).double()
         walking = distance > STOP_DISTANCE
         asked = SPEED * gap[:, :2] / distance.clamp(min=1e-6)[:, None] * walking[:, None]
         near = 1 / (1 + 4 * gap.square().sum(-1))

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.anymal import Anymal, into_base, rotation
+from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
 from tasks.curriculum import Averages, next_level
 from tasks.state import State
@@ -165,7 +165,7 @@ class AnymalPush(Anymal):
         turn, base = rotation(state), state.qpos[:, 0:3]
         observation[:, 45:48] = into_base(turn, state.qpos[:, 19:22] - base)
         observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - base)
-        return observation.clamp_(-20.0, 20.0)
+        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Approach the cube from behind, move it to the target, hold it there; walk well."""

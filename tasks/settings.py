@@ -57,12 +57,13 @@ _FAST = {"physics_timestep": 0.01}
 # settles. (With _ANYMAL and earlier rewards, success rose to 0.6 and fell again as targets moved away.)
 _PUSH = dataclasses.replace(
     _ANYMAL,
-    iterations=488,  # 12.0 M steps
+    iterations=380,
     num_envs=1024,
     entropy_coeff=0.001,
     desired_kl=0.012,
     adapt_every="iteration",
 )
+_PUSH_ON = dataclasses.replace(_PUSH, iterations=108, entropy_coeff=0.0)
 _CLIMB_ON = dataclasses.replace(
     _ANYMAL, iterations=220, entropy_coeff=0.0, desired_kl=0.01, max_learning_rate=1e-3
 )
@@ -90,7 +91,9 @@ _TRIFINGER = PPOConfig(
 
 SETTINGS: dict[str, Setting] = {
     "cartpole": Setting(PPOConfig()),
-    "anymal_push": Setting(_PUSH, _FAST),
+    # 9.3 M steps, then 2.7 M in steps of 0.005 s and without a bonus for noise. With 12.0 M of the first
+    # kind as many sampled episodes succeeded, but 59 % instead of 64 % without noise (one seed).
+    "anymal_push": Setting(_PUSH, _FAST, then=(Setting(_PUSH_ON),)),
     "anymal_climb": Setting(  # 21.4 M steps
         dataclasses.replace(_ANYMAL, iterations=1740),
         _FAST,

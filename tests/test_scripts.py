@@ -125,7 +125,7 @@ def test_the_page_about_the_tasks_is_what_the_code_says(tmp_path):
 @pytest.mark.slow
 def test_speed_writes_its_figures(tmp_path):
     figures = tmp_path / "speed.json"
-    tiny = ["--tasks", "anymal_push", "--rounds", "1", "--num-envs", "8", "--rows", "32"]
+    tiny = ["--tasks", "anymal_push", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
     run("benchmarks/speed.py", *tiny, "--output", figures)
     results = json.loads(figures.read_text())
     assert results["env"][0]["env_over_raw"] > 0
