@@ -1,6 +1,6 @@
 """How fast the hot paths are, as ratios to what they could be at best, measured side by side.
 
-    python benchmarks/speed.py            # all, about a minute on two cores
+    python benchmarks/speed.py            # all, about six minutes on two cores
     python benchmarks/speed.py --only env
 
 Every table compares our code with its limit in one run: environments with raw physics, losses with plain
