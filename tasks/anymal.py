@@ -15,7 +15,7 @@ import mujoco
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_range
+from tasks.base import Edit, Entry, Task, check_range, uniform
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation
@@ -235,15 +235,11 @@ class Anymal(Task):
     def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
         """Friction and mass; scalars, hence invariant under the group."""
         if self.friction is not None:
-            low, high = self.friction
-            draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
-            own = torch.as_tensor(self.model.geom_friction[:, 0].copy())
-            simulation.expand("geom_friction")[ids, :, 0] = draw[:, None] * own
+            self.scale_friction(simulation, ids, uniform(self.friction, len(ids), generator))
         if self.added_mass is not None:
-            low, high = self.added_mass
-            draw = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
             body = self.model.body("base").id
-            simulation.expand("body_mass")[ids, body] = self._mass + draw
+            mass = self._mass + uniform(self.added_mass, len(ids), generator)
+            simulation.expand("body_mass")[ids, body] = mass
             simulation.refresh(ids)
 
 

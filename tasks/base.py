@@ -184,6 +184,11 @@ class Task(abc.ABC):
         symmetric.
         """
 
+    def scale_friction(self, simulation: Simulation, ids: Tensor, factor: Tensor) -> None:
+        """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(k,)``."""
+        own = torch.from_numpy(self.model.geom_friction[:, 0].copy())
+        simulation.expand("geom_friction")[ids, :, 0] = factor[:, None] * own
+
     @abc.abstractmethod
     def control(self, action: Tensor, state: State) -> Tensor:
         """Actuator controls for actions: ``(n, action_size)`` in [-1, 1] to ``(n, nu)``.
@@ -268,6 +273,12 @@ def check_range(name: str, span: tuple[float, float] | None, above: float) -> No
     """
     if span is not None and not above < span[0] <= span[1] < math.inf:
         raise ValueError(f"{name}: expected a rising range above {above:g}, got {span}")
+
+
+def uniform(span: tuple[float, float], n: int, generator: torch.Generator | None) -> Tensor:
+    """Uniform draws of a range, ``(n,)`` float64."""
+    low, high = span
+    return low + (high - low) * torch.rand(n, generator=generator, dtype=torch.float64)
 
 
 def load_model(asset: str, edit: Edit | None = None) -> Any:

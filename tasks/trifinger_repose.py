@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_range, register
+from tasks.base import Edit, Entry, Task, check_range, register, uniform
 from tasks.curriculum import Averages, next_level
 from tasks.rotations import matrix_of
 from tasks.state import State
@@ -214,13 +214,9 @@ class TrifingerRepose(Task):
     def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
         """Mass of the cube and friction; scalars, hence invariant under the group."""
         if self.friction is not None:
-            low, high = self.friction
-            factor = low + (high - low) * torch.rand(len(ids), 1, generator=generator, dtype=torch.float64)
-            nominal = torch.from_numpy(self.model.geom_friction[:, 0].copy())
-            simulation.expand("geom_friction")[ids, :, 0] = nominal * factor
+            self.scale_friction(simulation, ids, uniform(self.friction, len(ids), generator))
         if self.cube_mass is not None:
-            low, high = self.cube_mass
-            mass = low + (high - low) * torch.rand(len(ids), generator=generator, dtype=torch.float64)
+            mass = uniform(self.cube_mass, len(ids), generator)
             cube = self.model.body("cube").id
             inertia = torch.from_numpy(self.model.body_inertia[cube] / self.model.body_mass[cube])
             simulation.expand("body_mass")[ids, cube] = mass
@@ -300,7 +296,7 @@ class TrifingerRepose(Task):
         return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
-        """Every term of the reward, weighted, per step; their sum is the reward."""
+        """Bring the corners to their goals, the fingertips to the cube, gently."""
         far = KERNEL * self._keypoint_distance(state)
         closer = state.variables["tip_distance"] - self.tip_distance(state)
         action = action.double().clamp(-1.0, 1.0)
@@ -312,10 +308,6 @@ class TrifingerRepose(Task):
             "action_rate": (action - state.variables["last_action"]).square().sum(dim=-1),
         }
         return {name: WEIGHTS[name] * term for name, term in terms.items()}
-
-    def reward(self, state: State, action: Tensor) -> Tensor:
-        """Bring the corners to their goals, the fingertips to the cube, gently."""
-        return torch.stack(tuple(self.reward_terms(state, action).values())).sum(dim=0)
 
     def terminated(self, state: State) -> Tensor:
         """The cube is outside the arena: over the wall, or thrown up."""

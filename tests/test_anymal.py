@@ -136,8 +136,9 @@ def test_time_in_the_air_is_counted_per_foot_and_paid_once_on_landing():
 @robots
 def test_steps_never_cost_and_pay_at_most_30_ms_a_foot(name):
     task = base.create(name)
-    state = task.sample_initial_state(500, torch.Generator().manual_seed(0))
-    state.variables["air_time"] = torch.rand(500, 4, dtype=torch.float64) * 3
+    generator = torch.Generator().manual_seed(0)
+    state = task.sample_initial_state(500, generator)
+    state.variables["air_time"] = torch.rand(500, 4, generator=generator, dtype=torch.float64) * 3
     paid = task.first_touch(state)
     assert (paid >= 0).all() and (paid <= 4 * 0.3 + 1e-12).all() and paid.max() > 1
 
