@@ -85,7 +85,7 @@ class PPOConfig:
     robots have a wide action box and work in a quarter of it."""
 
     max_log_ratio: float = 20.0
-    """Bound of log pi / pi_k for naive augmentation, which overflows without."""
+    """Bound of log pi / pi_k for naive augmentation, which overflows without; inf for none."""
     checkpoint_interval: int = 1
     """Iterations between checkpoints; the last one is always saved."""
     device: str = "cpu"
@@ -112,8 +112,9 @@ class PPOConfig:
             "max_std",
             "clip_epsilon",
             "output_scale",
+            "max_log_ratio",
         )
-        for name in (*positive, "output_scale"):
+        for name in positive:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         for name in ("gamma", "lmbda"):

@@ -253,7 +253,7 @@ def make_loss(
     if config.augmentation in ("all", "random"):
         kwargs |= {"elements": config.augmentation, "mirror_coeff": config.mirror_coeff}
         return [SymmetricClipPPOLoss(actor, critic, symmetry=symmetry, **kwargs)]
-    if config.augmentation == "naive":
+    if config.augmentation == "naive" and math.isfinite(config.max_log_ratio):
         kwargs["max_importance_ratio"] = math.exp(config.max_log_ratio)
     losses: list[LossModule] = [ClipPPOLoss(actor, critic, **kwargs)]
     if config.mirror_coeff > 0:

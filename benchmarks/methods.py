@@ -1,0 +1,108 @@
+"""The compared methods, each a change of one task's settings.
+
+A name is a sum of parts: what happens to the data (`ppo`, `aug`, `aug-random`, `aug-naive`,
+`aug-naive-raw`), `loss-W` for a mirror loss of weight W in the paper's convention (a sum over the group and
+the action's entries), `init-S` for initial weights S times as large. So `aug+loss-0.1` is augmentation with a
+mirror loss, `loss-1` plain PPO with one, `aug+init-4` augmentation from large weights.
+"""
+
+import dataclasses
+import math
+from typing import Any
+
+from tasks.settings import Setting
+
+AUGMENTATION: dict[str, dict[str, Any]] = {
+    "ppo": {"augmentation": "none"},
+    "aug": {"augmentation": "all"},
+    "aug-random": {"augmentation": "random"},
+    "aug-naive": {"augmentation": "naive"},
+    # Without the bounds of log-ratio and deviation that keep the naive rule finite.
+    "aug-naive-raw": {"augmentation": "naive", "max_log_ratio": math.inf, "max_std": math.inf},
+}
+
+LABELS = {
+    "ppo": "PPO",
+    "aug": "PPO + aug.",
+    "aug-random": "PPO + aug. (random)",
+    "aug-naive": "naive aug.",
+    "aug-naive-raw": "naive aug., unbounded",
+}
+"""How figures and tables call the parts."""
+
+# What `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as
+# many runs each (results/tuning); the rest is `tasks.settings`.
+TUNED: dict[str, dict[str, dict[str, Any]]] = {}
+
+
+def parts(method: str) -> tuple[str, float, float]:
+    """A method's augmentation, mirror weight and initial scale.
+
+    Raises:
+        ValueError: a part that is none of the module's.
+    """
+    augmentation, weight, scale = "ppo", 0.0, 1.0
+    for part in method.split("+"):
+        kind, _, number = part.rpartition("-")
+        try:
+            if part in AUGMENTATION:
+                augmentation = part
+            elif kind == "loss":
+                weight = float(number)
+            elif kind == "init":
+                scale = float(number)
+            else:
+                raise ValueError
+        except ValueError:
+            raise ValueError(
+                f"expected a method made of {list(AUGMENTATION)}, loss-W and init-S, joined by +, got "
+                f"{part!r} in {method!r}"
+            ) from None
+    return augmentation, weight, scale
+
+
+def family(method: str) -> str:
+    """Methods that are tuned together: plain PPO, augmentation, mirror loss, naive augmentation."""
+    augmentation, weight, _ = parts(method)
+    if augmentation.startswith("aug-naive"):
+        return "aug-naive"
+    if augmentation == "ppo":
+        return "loss" if weight else "ppo"
+    return "aug"
+
+
+def label(method: str) -> str:
+    """How figures and tables call a method."""
+    augmentation, weight, scale = parts(method)
+    text = LABELS[augmentation]
+    if weight:
+        text += f" + loss-{weight:g}"
+    return text if scale == 1.0 else f"{text}, init-{scale:g}"
+
+
+def configure(
+    task: str, method: str, setting: Setting, seed: int, steps: int | None = None, **changes: Any
+) -> Setting:
+    """Settings of one run.
+
+    Args:
+        task: its name, for what was tuned on it.
+        method: a name as above.
+        setting: the task's settings.
+        seed: seed of the run.
+        steps: environment steps, instead of the setting's; stages shrink alike.
+        **changes: further changes of the configuration.
+    """
+    augmentation, weight, scale = parts(method)
+    tuned = TUNED.get(task, {}).get(family(method), {})
+    config = {"mirror_coeff": weight, "weight_scale": scale, "seed": seed}
+    setting = setting.replace(**tuned | AUGMENTATION[augmentation] | config | changes)
+    if steps is None:
+        return setting
+    share = steps / setting.frames
+    rounds = [max(1, math.ceil(stage.config.iterations * share - 1e-9)) for stage in setting.stages]
+    first, *later = (
+        dataclasses.replace(stage, config=dataclasses.replace(stage.config, iterations=count), then=())
+        for stage, count in zip(setting.stages, rounds, strict=True)
+    )
+    return dataclasses.replace(first, then=tuple(later))

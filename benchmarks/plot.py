@@ -1,0 +1,239 @@
+"""Draws every figure and table of a comparison from its stored results alone.
+
+    python benchmarks/plot.py paper-cartpole
+
+Figures: `training` (the paper's learning curves of return and symmetry loss), `log_prob` (its log action
+probabilities of augmented samples, original rule against naive), `initialization` (its study of initial
+weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a return, over steps and seconds).
+Lines are interquartile means over seeds, bands their 95 % bootstrap intervals. `tables.md` has the numbers.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import tyro
+from intervals import band, iqm
+from matplotlib.axes import Axes
+from methods import label, parts
+from study import Study, read
+from tables import seconds_per_step, steps_to, tables, threshold
+
+HERE = Path(__file__).parent
+COLORS = {
+    "ppo": "tab:orange",
+    "aug": "tab:blue",
+    "aug-random": "tab:cyan",
+    "aug-naive": "tab:red",
+    "aug-naive-raw": "tab:brown",
+}
+SHADES = {"ppo": "Greens", "aug": "Purples"}  # with a mirror loss, darker for larger weights
+SCALES = "viridis"  # initial weights, from small to large
+
+
+def draw_all(results: Path, plots: Path) -> list[Path]:
+    """Draw everything that the results have; returns what was written."""
+    study = read(results)
+    plots.mkdir(parents=True, exist_ok=True)
+    drawn = {
+        "training": training(study),
+        "log_prob": log_prob(study),
+        "initialization": initialization(study),
+        "goals": goals(study),
+        "efficiency": efficiency(study),
+    }
+    written = []
+    for name, figure in drawn.items():
+        if figure is not None:
+            written.append(plots / f"{name}.png")
+            figure.savefig(written[-1], dpi=110)
+            plt.close(figure)
+    written.append(plots / "tables.md")
+    written[-1].write_text(tables(study))
+    return written
+
+
+def grid(rows: int, columns: int, width: float = 4.0, height: float = 2.9):
+    """Empty panels without frames."""
+    size = (width * columns, height * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, layout="constrained", squeeze=False)
+    for axis in axes.flat:
+        axis.spines[["top", "right"]].set_visible(False)
+        axis.grid(alpha=0.25, linewidth=0.5)
+    return figure, axes
+
+
+def color(method: str):
+    """A method's colour: hue for the augmentation, shade for the weight of the mirror loss."""
+    augmentation, weight, _ = parts(method)
+    if not weight or augmentation not in SHADES:
+        return COLORS[augmentation]
+    return matplotlib.colormaps[SHADES[augmentation]](np.clip(0.7 + 0.2 * np.log10(weight), 0.35, 0.95))
+
+
+def draw_curve(axis: Axes, study: Study, task: str, method: str, column: str, **style) -> None:
+    """Interquartile mean and interval over environment steps; of the logarithm where the axis has one."""
+    steps, values = study.curve(task, method, column)
+    logarithmic = axis.get_yscale() == "log"
+    if logarithmic:
+        values = np.log(np.maximum(values, 1e-12))
+    known = np.isfinite(values).all(axis=0)
+    if not known.any():
+        return
+    steps, values = steps[known], values[:, known]
+    lines = [iqm(values), *band(values)]
+    middle, low, high = (np.exp(line) for line in lines) if logarithmic else lines
+    axis.plot(steps, middle, linewidth=1.4, **{"color": color(method), "label": label(method)} | style)
+    axis.fill_between(steps, low, high, color=axis.lines[-1].get_color(), alpha=0.15, linewidth=0)
+
+
+def training(study: Study):
+    """Return and symmetry loss over environment steps, a column per task."""
+    figure, axes = grid(2, len(study.tasks), 5.2)
+    for (top, bottom), task in zip(axes.T, study.tasks, strict=True):
+        bottom.set_yscale("log")
+        for method in without(study.methods(task), naive=True, scales=True):
+            draw_curve(top, study, task, method, "return")
+            draw_curve(bottom, study, task, method, "mirror_loss")
+        top.set(title=task, ylabel="training return")
+        bottom.set(xlabel="million environment steps", ylabel="symmetry loss")
+        legend(top)
+    return figure
+
+
+def log_prob(study: Study):
+    """Log-probabilities that the update divides by, averaged over augmented samples, every seed a line."""
+    rules = {"aug": "log_prob", "aug-naive": "log_prob_copies", "aug-naive-raw": "log_prob_copies"}
+    shown = [task for task in study.tasks if {"aug", "aug-naive"} <= set(study.methods(task))]
+    if not shown:
+        return None
+    figure, axes = grid(2, len(shown), 5.2)
+    for (top, bottom), task in zip(axes.T, shown, strict=True):
+        for method, column in rules.items():
+            if method not in study.methods(task):
+                continue
+            steps, values = study.curve(task, method, column)
+            top.plot(steps, values.T, color=color(method), linewidth=0.8, alpha=0.8)
+            top.plot([], [], color=color(method), label=label(method))
+            draw_curve(bottom, study, task, method, "return")
+        top.set_yscale("symlog", linthresh=10)
+        top.set(title=f"{task}: log probability in the denominator", ylabel="mean over augmented samples")
+        bottom.set(xlabel="million environment steps", ylabel="training return")
+        legend(top)
+    return figure
+
+
+def initialization(study: Study):
+    """Return and symmetry loss by the scale of the initial weights, with and without a small mirror loss."""
+    groups: dict[tuple[str, str], list[str]] = {}
+    for task in study.tasks:
+        scaled = {method.split("+init-")[0] for method in study.methods(task) if "+init-" in method}
+        for method in study.methods(task):
+            base = method.split("+init-")[0]
+            if base in scaled:
+                groups.setdefault((task, base), []).append(method)
+    if not groups:
+        return None
+    figure, axes = grid(2, len(groups), 4.6)
+    scales = sorted({parts(method)[2] for methods in groups.values() for method in methods})
+    for (top, bottom), ((task, base), methods) in zip(axes.T, groups.items(), strict=True):
+        bottom.set_yscale("log")
+        for method in sorted(methods, key=lambda m: parts(m)[2]):
+            scale = parts(method)[2]
+            shade = scales.index(scale) / max(1, len(scales) - 1) * 0.85
+            style = {"color": matplotlib.colormaps[SCALES](shade), "label": f"init-{scale:g}"}
+            draw_curve(top, study, task, method, "return", **style)
+            draw_curve(bottom, study, task, method, "mirror_loss", **style)
+        top.set(title=f"{task}: {label(base)}", ylabel="training return")
+        bottom.set(xlabel="million environment steps", ylabel="symmetry loss")
+        legend(top)
+    for row in axes:
+        share_limits(row)
+    return figure
+
+
+def share_limits(axes: Iterable[Axes]) -> None:
+    """The same vertical range for panels that are compared."""
+    limits = [axis.get_ylim() for axis in axes]
+    for axis in axes:
+        axis.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+
+
+def goals(study: Study):
+    """Evaluated return of every equivalent goal, one vertical line per seed."""
+    figure, axes = grid(1, len(study.tasks), 6.4, 4.2)
+    markers = "><^vDs"
+    for axis, task in zip(axes[0], study.tasks, strict=True):
+        methods = study.methods(task)
+        for place, method in enumerate(methods):
+            names, values = study.goal_returns(task, method)
+            offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else [0.0]
+            for x, row in zip(place + np.asarray(offsets), values, strict=True):
+                axis.plot([x, x], [row.min(), row.max()], color=color(method), linewidth=1, alpha=0.6)
+                for marker, value in zip(markers, row, strict=False):
+                    axis.plot(x, value, marker, color=color(method), markersize=3.5, markeredgewidth=0)
+            legend_goals = names
+        axis.set_xticks(
+            range(len(methods)), [label(m) for m in methods], rotation=40, ha="right", fontsize=7.5
+        )
+        what = ", ".join(f"{m} {name}" for m, name in zip("▸◂▴▾◆■", legend_goals, strict=False))
+        axis.set(title=f"{task}: {what}", ylabel="mean return of a goal, per seed")
+        axis.grid(axis="x", visible=False)
+    return figure
+
+
+def efficiency(study: Study):
+    """Share of seeds whose training return has reached a threshold, over steps and over seconds."""
+    figure, axes = grid(2, len(study.tasks), 5.2)
+    for (top, bottom), task in zip(axes.T, study.tasks, strict=True):
+        goal = threshold(study, task)
+        for method in without(study.methods(task), naive=True, scales=True):
+            reached = np.sort(steps_to(study, task, method, goal))
+            share = np.arange(1, len(reached) + 1) / len(reached)
+            known = np.isfinite(reached)
+            end = study.curve(task, method, "return")[0][-1]
+            x = np.concatenate([[0.0], reached[known], [end]])
+            y = np.concatenate([[0.0], share[known], share[known][-1:] if known.any() else [0.0]])
+            style = {"color": color(method), "label": label(method), "where": "post", "linewidth": 1.4}
+            top.step(x, y, **style)
+            bottom.step(x * 1e6 * seconds_per_step(study, task, method), y, **style)
+        top.set(
+            title=f"{task}: training return ≥ {goal:.2f}",
+            xlabel="million environment steps",
+            ylabel="share of seeds",
+        )
+        bottom.set(xlabel="seconds on one core", ylabel="share of seeds")
+        legend(top)
+    return figure
+
+
+def without(methods: Iterable[str], *, naive: bool, scales: bool) -> list[str]:
+    """Methods without the naive ones, and without other initial weights."""
+    kept = [m for m in methods if not (naive and parts(m)[0].startswith("aug-naive"))]
+    return [m for m in kept if not (scales and parts(m)[2] != 1.0)]
+
+
+def legend(axis: Axes) -> None:
+    if axis.get_legend_handles_labels()[0]:
+        axis.legend(frameon=False, fontsize=7.5)
+
+
+@dataclass
+class Arguments:
+    """Draw figures and tables from stored results."""
+
+    name: tyro.conf.Positional[str] = "paper-cartpole"
+    """What the results are called."""
+    results: Path = HERE / "results"
+    """Where results are, in a folder of their name."""
+    plots: Path = HERE / "plots"
+    """Where figures and tables go, in a folder of the results' name."""
+
+
+if __name__ == "__main__":
+    arguments = tyro.cli(Arguments)
+    for path in draw_all(arguments.results / arguments.name, arguments.plots / arguments.name):
+        print(f"wrote {path}")

@@ -1,0 +1,102 @@
+"""Executes runs in parallel: one process each, a bar for each, and none stops the others.
+
+Processes are forked from a server that has imported everything once, so that a run starts in a fraction of a
+second. They report through their files alone (`Run.progress`), end with the process that started them, and
+may crash: what happened is in the run's `log.txt`.
+"""
+
+import multiprocessing
+import os
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Sequence
+
+from runs import Run
+from tqdm import tqdm
+
+POLL = 0.5  # seconds between two looks at the runs' files
+
+
+def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
+    """Execute what is not finished, at most `workers` at a time; returns the runs that failed."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrl_sym.recipes", "tasks.evaluation", "tyro", "tqdm"])
+    waiting = [run for run in runs if run.result() is None]
+    active: dict[int, tuple[Run, multiprocessing.Process, tqdm]] = {}  # by line on the screen
+    failed: list[Run] = []
+    total = sum(run.iterations for run in runs)
+    before = total - sum(run.iterations - run.progress()[0] for run in waiting)
+    bar = tqdm(total=total, initial=before, unit="it", smoothing=0.02, disable=None)
+    bar.set_description(f"{len(runs) - len(waiting)}/{len(runs)} runs")
+    ended = len(runs) - len(waiting)
+    try:
+        while waiting or active:
+            for line in range(1, workers + 1):
+                if waiting and line not in active:
+                    active[line] = _start(context, waiting.pop(0), line)
+            time.sleep(POLL)
+            for line, (run, process, own) in list(active.items()):
+                done, latest = run.progress()
+                bar.update(done - own.n)
+                own.update(done - own.n)
+                own.set_postfix_str(f"return {latest:.2f}")
+                if process.is_alive():
+                    continue
+                own.close()
+                del active[line]
+                ended += 1
+                bar.set_description(f"{ended}/{len(runs)} runs")
+                result = run.result()
+                if result is None:
+                    failed.append(run)
+                tqdm.write(f"[{ended}/{len(runs)}] {run}: {_report(run, result, process.exitcode)}")
+    finally:
+        for _, process, own in active.values():
+            process.terminate()
+            process.join()
+            own.close()
+        bar.close()
+    return failed
+
+
+def _start(context, run: Run, line: int) -> tuple[Run, multiprocessing.Process, tqdm]:
+    process = context.Process(target=_work, args=(run,), name=str(run))
+    process.start()
+    own = tqdm(total=run.iterations, initial=run.progress()[0], position=line, leave=False, disable=None)
+    own.set_description(str(run))
+    return run, process, own
+
+
+def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
+    if result is None:
+        log = run.folder / "log.txt"
+        text = log.read_text().strip().splitlines() if log.exists() else []
+        return f"FAILED with exit code {exitcode}: {text[-1] if text else 'no output'} (see {log})"
+    if result["outcome"] != "finished":
+        return f"{result['outcome']} (after {result['iterations']} iterations)"
+    rows = [row for row in result["evaluation"] if row["actions"] == "deterministic"]
+    returns = ", ".join(f"{row['goal']} {row['return']:.2f}" for row in rows)
+    return f"{returns} ({result['seconds']:.0f} s)"
+
+
+def _work(run: Run) -> None:
+    """The life of a worker: all it prints goes to its log."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    run.folder.mkdir(parents=True, exist_ok=True)
+    with (run.folder / "log.txt").open("a") as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    try:
+        run.execute()
+    except Exception:
+        traceback.print_exc()
+        sys.exit(1)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)  # killed: what was written so far is enough to continue

@@ -1,0 +1,211 @@
+"""One run of a comparison: train one method on one task with one seed, then evaluate every goal.
+
+A run owns a folder: `stage_0`, `stage_1`, ... with what `recipes.train` writes, `result.json` once it is
+finished, `log.txt` with everything it printed. So a run that was killed is continued by executing it again,
+and a finished one is recognised by its result.
+"""
+
+import csv
+import dataclasses
+import fcntl
+import functools
+import importlib
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+import tasks
+from tasks.environment import BatchedEnv
+from tasks.evaluation import Evaluation, evaluate
+from tasks.settings import SETTINGS, Setting
+from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train
+
+EVALUATION_SEED = 1000  # the same starts for every run
+ACTIONS = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
+
+
+@dataclass(frozen=True)
+class Run:
+    """What to train, and where.
+
+    Attributes:
+        task: a name of `tasks.ALL_TASKS`, or `module:function`.
+        method: its name in the results.
+        seed: seed of weights, starts and exploration.
+        setting: hyper-parameters, all stages.
+        folder: where it keeps its files.
+        episodes: evaluation episodes per goal.
+        threads: physics and torch threads.
+    """
+
+    task: str
+    method: str
+    seed: int
+    setting: Setting
+    folder: Path
+    episodes: int = 500
+    threads: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.task} {self.method} {self.seed}"
+
+    def request(self) -> dict[str, Any]:
+        """What was asked for, as JSON."""
+        stages = [{"config": dataclasses.asdict(s.config), "task": s.task} for s in self.setting.stages]
+        asked = {"task": self.task, "method": self.method, "seed": self.seed, "episodes": self.episodes}
+        return json.loads(json.dumps(asked | {"stages": stages}))
+
+    def result(self) -> dict[str, Any] | None:
+        """The result, if this very run has been finished."""
+        path = self.folder / "result.json"
+        result = json.loads(path.read_text()) if path.exists() else {}
+        return result if all(result.get(key) == value for key, value in self.request().items()) else None
+
+    def progress(self) -> tuple[int, float]:
+        """Iterations done so far, and the latest mean return (NaN at first)."""
+        done, latest = 0, float("nan")
+        for number in range(len(self.setting.stages)):
+            table = self.folder / f"stage_{number}" / "metrics.csv"
+            lines = table.read_text().split("\n")[:-1] if table.exists() else []  # the last may be half written
+            if len(lines) > 1:
+                done += len(lines) - 1
+                latest = float(next(csv.DictReader([lines[0], lines[-1]]))["return"])
+        return done, latest
+
+    @property
+    def iterations(self) -> int:
+        """Iterations in all."""
+        return sum(stage.config.iterations for stage in self.setting.stages)
+
+    def curve(self) -> list[dict[str, float]]:
+        """Metrics of all stages, with frames and seconds counted through."""
+        whole: list[dict[str, float]] = []
+        for number in range(len(self.setting.stages)):
+            table = self.folder / f"stage_{number}" / "metrics.csv"
+            before = whole[-1] if whole else {"frames": 0, "seconds": 0.0}
+            for row in read_metrics(table) if table.exists() else []:
+                through = {key: row[key] + before[key] for key in ("frames", "seconds")}
+                whole.append({"stage": number, **row, **through})
+        return whole
+
+    def execute(self) -> None:
+        """Train and evaluate, from wherever the folder is; other processes on the same folder wait."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with (self.folder / "lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if self.result() is None:
+                self._execute()
+
+    def _execute(self) -> None:
+        torch.set_num_threads(self.threads)
+        make_env = environment(self.task, self.threads)
+        outcome = "finished"
+        folders: list[Path] = []
+        for stage in self.setting.stages:
+            make = functools.partial(make_env, **stage.task)
+            where = {
+                "folder": self.folder / f"stage_{len(folders)}",
+                "start_from": folders[-1] if folders else None,
+            }
+            folders.append(where["folder"])
+            try:
+                for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
+                    pass
+            except FloatingPointError as error:  # a result like any other: the same seed would end here again
+                outcome = f"diverged: {error}"
+                break
+        curve = self.curve()
+        result = self.request() | {
+            "outcome": outcome,
+            "iterations": len(curve),
+            "frames": curve[-1]["frames"] if curve else 0,
+            "seconds": curve[-1]["seconds"] if curve else 0.0,
+            "evaluation": self._evaluate(make_env, folders[-1]),
+        }
+        partial = self.folder / "result.partial"
+        partial.write_text(json.dumps(result, indent=1) + "\n")
+        os.replace(partial, self.folder / "result.json")
+
+    def _evaluate(self, make_env: Callable[..., EnvBase], checkpoint: Path) -> list[dict[str, Any]]:
+        """One row per evaluated task, kind of actions and goal; none if there is no checkpoint."""
+        rows = []
+        for what, kwargs in self.setting.evaluations.items():
+            env = make_env(num_envs=1, seed=EVALUATION_SEED, **kwargs)
+            try:
+                actor = load_actor(checkpoint, env, env.symmetry)
+            except FileNotFoundError:  # it diverged before the first one
+                return []
+            for actions, exploration in ACTIONS.items():
+                if isinstance(env, BatchedEnv):
+                    threads = {"num_threads": self.threads, "exploration": exploration}
+                    outcome = evaluate(env, actor, self.episodes, seed=EVALUATION_SEED, **threads)
+                else:
+                    many = make_env(num_envs=self.episodes, seed=EVALUATION_SEED, **kwargs)
+                    outcome = evaluate_plainly(many, actor, exploration)
+                rows += [{"what": what, "actions": actions, **row} for row in goal_rows(outcome)]
+        return rows
+
+
+def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
+    """Return, return of the task's own terms and success rate of every goal; None where undefined."""
+    return [
+        {
+            "goal": goal,
+            "return": value,
+            "task_return": outcome.task_means.get(goal),
+            "success": outcome.goal_successes.get(goal),
+        }
+        for goal, value in outcome.goal_means.items()
+    ]
+
+
+def evaluate_plainly(
+    env: EnvBase, actor: ProbabilisticTensorDictSequential, exploration: ExplorationType
+) -> Evaluation:
+    """Return of one episode per row of an environment whose equivalent goals are not known."""
+    with torch.no_grad(), set_exploration_type(exploration):
+        following = env.reset()
+        running = ~following["done"]
+        returns = torch.zeros(running.shape, dtype=torch.float64)
+        while bool(running.any()):
+            tensordict, following = env.step_and_maybe_reset(actor(following))
+            returns += tensordict["next", "reward"].double() * running
+            running &= ~tensordict["next", "done"]
+    return Evaluation(("all",), returns.reshape(1, -1))
+
+
+def environment(task: str, threads: int = 1) -> Callable[..., EnvBase]:
+    """What makes a task's environments: called with `num_envs`, `seed` and the task's own arguments.
+
+    Raises:
+        ValueError: neither a task's name nor an importable `module:function`.
+    """
+    if task in tasks.ALL_TASKS:
+        return functools.partial(tasks.make_env, task, num_threads=threads)
+    module, _, name = task.partition(":")
+    if "" not in sys.path:
+        sys.path.insert(0, "")  # where the command was given, as `python -m` has it
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"expected a task of {list(tasks.ALL_TASKS)}, or module:function that takes num_envs and seed "
+            f"and returns an environment with a symmetry, got {task!r} ({error})"
+        ) from error
+
+
+def task_setting(task: str) -> Setting:
+    """Settings of a task; of another one, what its module calls SETTING, or the recipe's defaults."""
+    if task in SETTINGS:
+        return SETTINGS[task]
+    environment(task)
+    return getattr(importlib.import_module(task.partition(":")[0]), "SETTING", Setting(PPOConfig()))

@@ -1,0 +1,171 @@
+"""The results of a comparison on disk: two tidy tables and a description, from which all else is drawn.
+
+* `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
+* `curves.csv`: a row per run and logged iteration of the training.
+* `study.json`: command, commit, versions, machine; hyper-parameters per task and method; what failed.
+"""
+
+import csv
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from provenance import provenance
+from runs import Run
+
+RUN = ("task", "method", "seed")
+EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")
+CURVE = (
+    *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
+    *("std", "learning_rate", "kl", "success", "level", "phase"),
+)
+POINTS = 210  # rows per curve that are kept, at most
+
+
+def write(folder: Path, runs: Sequence[Run], failed: Sequence[Run], about: dict[str, Any]) -> None:
+    """Write the results of all finished runs."""
+    folder.mkdir(parents=True, exist_ok=True)
+    evaluated, curves, methods = [], [], {}
+    for run in runs:
+        result = run.result()
+        if result is None:
+            continue
+        name = dict(zip(RUN, (run.task, run.method, run.seed), strict=True))
+        ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
+        ended["outcome"] = ended["outcome"].split(":")[0]
+        rows = result["evaluation"] or [{}]
+        evaluated += [name | ended | row for row in rows]
+        curve = run.curve()
+        every = math.ceil(len(curve) / POINTS)
+        curves += [name | row for row in curve[::-every][::-1]]  # the last row is kept
+        methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
+    _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
+    _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
+    about = provenance() | about | {"failed": [str(run) for run in failed], "methods": methods}
+    _replace(folder / "study.json", json.dumps(about, indent=1) + "\n")
+
+
+def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [stage | {"config": {k: v for k, v in stage["config"].items() if k != "seed"}} for stage in stages]
+
+
+def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+    used = [name for name in columns if any(row.get(name) is not None for row in rows)]
+    partial = path.with_suffix(".partial")
+    with partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, used, extrasaction="ignore", restval="", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: _short(value) for key, value in row.items()} for row in rows)
+    os.replace(partial, path)
+
+
+def _short(value: Any) -> Any:
+    return f"{value:.6g}" if isinstance(value, float) else value
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_text(text)
+    os.replace(partial, path)
+
+
+@dataclass(frozen=True)
+class Study:
+    """Results, read back.
+
+    Attributes:
+        about: `study.json`.
+        runs: rows of `runs.csv`; numbers as floats, None where empty.
+        curves: columns of `curves.csv` by (task, method, seed).
+    """
+
+    about: dict[str, Any]
+    runs: list[dict[str, Any]]
+    curves: dict[tuple[str, str, int], dict[str, np.ndarray]]
+
+    @property
+    def tasks(self) -> list[str]:
+        """Tasks, in the order of the study."""
+        return list(self.about["methods"])
+
+    def methods(self, task: str) -> list[str]:
+        """Methods of a task, in the order of the study."""
+        return list(self.about["methods"].get(task, {}))
+
+    def seeds(self, task: str, method: str) -> list[int]:
+        """Seeds of a method."""
+        return [seed for t, m, seed in self.curves if (t, m) == (task, method)]
+
+    def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
+        """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
+
+        A run that diverged keeps its last value, so that it is not dropped from the average.
+        """
+        columns = [c for (t, m, _), c in self.curves.items() if (t, m) == (task, method)]
+        longest = max(columns, key=lambda c: len(c["frames"]))["frames"]
+        values = np.full((len(columns), len(longest)), np.nan)
+        for row, c in zip(values, columns, strict=True):
+            row[: len(c[column])] = c[column]
+            row[len(c[column]) :] = c[column][-1]
+        return longest / 1e6, values
+
+    def goal_returns(
+        self, task: str, method: str, column: str = "return", actions: str = "deterministic"
+    ) -> tuple[list[str], np.ndarray]:
+        """Names of the goals, and their mean returns ``(seeds, goals)`` in the first evaluation."""
+        rows = [r for r in self.runs if (r["task"], r["method"]) == (task, method)]
+        rows = [r for r in rows if r.get("actions") == actions]
+        first = rows[0]["what"] if rows else None
+        rows = [r for r in rows if r["what"] == first]
+        goals = list(dict.fromkeys(r["goal"] for r in rows))
+        seeds = list(dict.fromkeys(r["seed"] for r in rows))
+        found = {(r["seed"], r["goal"]): r.get(column) for r in rows}
+        values = [[math.nan if found[s, g] is None else found[s, g] for g in goals] for s in seeds]
+        return goals, np.array(values).reshape(len(seeds), len(goals))
+
+    def diverged(self, task: str, method: str) -> int:
+        """Runs of a method that ended in numbers that are not finite."""
+        rows = [r for r in self.runs if (r["task"], r["method"]) == (task, method)]
+        return len({r["seed"] for r in rows if r["outcome"] == "diverged"})
+
+
+def read(folder: Path) -> Study:
+    """Read what `write` wrote.
+
+    Raises:
+        FileNotFoundError: there are no results.
+    """
+    about = json.loads((folder / "study.json").read_text())
+    runs = [{key: _number(value) for key, value in row.items()} for row in _rows(folder / "runs.csv")]
+    grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
+    for row in _rows(folder / "curves.csv"):
+        grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
+    curves = {
+        key: {
+            name: np.array([float(row[name] or "nan") for row in rows])
+            for name in rows[0]
+            if name not in RUN
+        }
+        for key, rows in grouped.items()
+    }
+    return Study(about, runs, curves)
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _number(text: str) -> Any:
+    if text == "":
+        return None
+    try:
+        value = float(text)
+    except ValueError:
+        return text
+    return int(value) if value.is_integer() and text.lstrip("-").isdigit() else value

@@ -1,0 +1,114 @@
+"""The numbers of a comparison as Markdown: Table I of the paper, and how fast each method gets there."""
+
+import numpy as np
+from intervals import estimate, iqm
+from methods import label
+from study import Study
+
+SMOOTHING = 5  # logged iterations over which a training return is averaged
+SHARE = 0.9  # of the way from the first return to the best method's last: the threshold of efficiency
+
+
+def tables(study: Study) -> str:
+    """All tables of a study."""
+    text = f"Made by `{study.about['command']}` at {study.about['revision']}, "
+    text += f"{study.about['machine']}, {study.about['workers']} runs at a time.\n"
+    for task in study.tasks:
+        text += f"\n## {task}\n\n{table_1(study, task)}\n{efficiency_table(study, task)}"
+    return text
+
+
+def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
+    """Return and variation between equivalent goals, per method (the paper's Table I)."""
+    head = ["method", "seeds", "return", "variation", "largest variation", "symmetry loss"]
+    shown = methods or study.methods(task)
+    successes = {m: study.goal_returns(task, m, "success")[1] for m in shown}
+    has_success = any(np.isfinite(s).any() for s in successes.values())
+    rows = [[*head, "success", "worst goal"] if has_success else head]
+    rows.append(["---", *["---:"] * (len(rows[0]) - 1)])
+    for method in shown:
+        returns = study.goal_returns(task, method)[1]
+        seeds = len(study.seeds(task, method))
+        gone = study.diverged(task, method)
+        row = [label(method), f"{seeds} ({gone} diverged)" if gone else str(seeds)]
+        if not len(returns):
+            rows.append([*row, *["-"] * (len(rows[0]) - 2)])
+            continue
+        variations = variation(returns)
+        loss = np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12)
+        row += [estimate(returns.mean(axis=1)).format(), estimate(variations).format()]
+        row += [f"{variations.max():.3f}", f"{np.exp(iqm(np.log(loss))):.2g}"]
+        if has_success:
+            row += [f"{successes[method].mean():.1%}", f"{successes[method].mean(axis=0).min():.1%}"]
+        rows.append(row)
+    note = (
+        "*return*: mean over the equivalent goals, mean actions; *variation*: the largest difference between\n"
+        "two goals; both as interquartile mean over seeds with its 95 % bootstrap interval. *largest\n"
+        "variation*: that of the worst seed. *symmetry loss*: sum over the group of ||K_g[π(s)] − π(L_g[s])||²\n"
+        "on the states of the last iteration (interquartile mean of logarithms).\n"
+    )
+    return markdown(rows) + "\n" + note
+
+
+def efficiency_table(study: Study, task: str) -> str:
+    """Environment steps and seconds until the training return reaches a threshold."""
+    goal = threshold(study, task)
+    rows = [["method", "reached", "million steps, median", "seconds, median", "steps per second"]]
+    rows.append(["---", *["---:"] * 4])
+    for method in study.methods(task):
+        reached = steps_to(study, task, method, goal)
+        cost = seconds_per_step(study, task, method)
+        middle = np.median(reached) if len(reached) else np.inf
+        known = [f"{middle:.2f}", f"{middle * 1e6 * cost:.0f}"] if np.isfinite(middle) else ["-", "-"]
+        count = f"{np.isfinite(reached).sum()} of {len(reached)}"
+        rows.append([label(method), count, *known, f"{1 / cost:,.0f}"])
+    note = (
+        f"Until the training return, averaged over {SMOOTHING} logged iterations, reaches {goal:.2f}: "
+        f"{SHARE:.0%} of the way from\nits first value to the best method's last. Seeds that never do count as "
+        "infinite in the median. One process\nwith one thread per run.\n"
+    )
+    return markdown(rows) + "\n" + note
+
+
+def variation(returns: np.ndarray) -> np.ndarray:
+    """Largest difference between the mean returns of two goals, ``(seeds, goals)`` to ``(seeds,)``."""
+    return returns.max(axis=1) - returns.min(axis=1)
+
+
+def threshold(study: Study, task: str) -> float:
+    """A return that a good run reaches, well above the first one."""
+    first, last = [], []
+    for method in study.methods(task):
+        values = study.curve(task, method, "return")[1]
+        known = np.isfinite(values).all(axis=0)
+        if known.any():
+            first.append(iqm(values[:, known][:, 0]))
+            last.append(iqm(values[:, known][:, -1]))
+    if not first:
+        return float("nan")
+    return float((1 - SHARE) * np.min(first) + SHARE * np.max(last))
+
+
+def steps_to(study: Study, task: str, method: str, goal: float) -> np.ndarray:
+    """Million steps at which each seed's smoothed training return first reaches a value; inf if never."""
+    steps, values = study.curve(task, method, "return")
+    if not np.isfinite(goal) or len(steps) < SMOOTHING:
+        return np.full(len(values), np.inf)
+    smooth = np.lib.stride_tricks.sliding_window_view(values, SMOOTHING, axis=1).mean(axis=-1)
+    there = smooth >= goal
+    return np.where(there.any(axis=1), steps[SMOOTHING - 1 :][there.argmax(axis=1)], np.inf)
+
+
+def seconds_per_step(study: Study, task: str, method: str) -> float:
+    """Wall-clock seconds per environment step: the median over all logged intervals of all seeds."""
+    costs = [
+        np.diff(c["seconds"]) / np.diff(c["frames"])
+        for (t, m, _), c in study.curves.items()
+        if (t, m) == (task, method) and len(c["frames"]) > 1
+    ]
+    return float(np.median(np.concatenate(costs))) if costs else float("nan")
+
+
+def markdown(rows: list[list[str]]) -> str:
+    """A table; the second row aligns the columns."""
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)

@@ -1,0 +1,119 @@
+"""The same search for every family of methods, so that no baseline is weaker for want of tuning.
+
+    python benchmarks/tune.py                        # CartPole: about 40 minutes on two cores
+
+Every family (plain PPO, augmentation, mirror loss, naive augmentation) tries the same candidates with the
+same seeds; the best two get more seeds; the best mean return wins. The seeds are not those of the
+comparison. The winners are written down in `methods.TUNED` by hand.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import study
+import tyro
+from methods import AUGMENTATION, configure
+from pool import execute_all
+from runs import Run, task_setting
+
+HERE = Path(__file__).parent
+FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
+FIRST, MORE = (100, 101), (102, 103, 104)  # seeds of both rounds
+KEPT = 2  # candidates per family that get the second round's seeds
+
+# What is varied around the task's settings, one at a time. Batches and networks stay the same, so
+# that all methods cost alike.
+CANDIDATES: dict[str, dict[str, Any]] = {
+    "settings": {},
+    "entropy 0.01": {"entropy_coeff": 0.01},
+    "gamma 0.99": {"gamma": 0.99},
+    "KL 0.005": {"desired_kl": 0.005},
+    "KL 0.02": {"desired_kl": 0.02},
+    "rate per iteration": {"adapt_every": "iteration"},
+}
+
+
+@dataclass
+class Arguments:
+    """Search, with the same effort for every family."""
+
+    task: str = "cartpole"
+    """What to tune on."""
+    families: tuple[str, ...] = FAMILIES
+    """One method of each family."""
+    steps: int = 2_457_600
+    """Environment steps per run."""
+    candidates: int = len(CANDIDATES)
+    """How many of the candidates, from the first."""
+    episodes: int = 200
+    """Evaluation episodes per goal."""
+    workers: int = os.cpu_count() or 1
+    """Runs at a time."""
+    folder: Path = Path("runs/tune")
+    """Where runs keep checkpoints and logs."""
+    output: Path = HERE / "results" / "tuning"
+    """Where results go."""
+
+
+def main(arguments: Arguments) -> int:
+    names = list(CANDIDATES)[: arguments.candidates]
+    runs = [make_run(arguments, f, c, seed) for seed in FIRST for f in arguments.families for c in names]
+    failed = execute_all(runs, arguments.workers)
+    for f in arguments.families:
+        best = sorted(names, key=lambda c: -score(runs, f, c))[:KEPT]
+        runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
+    failed += execute_all([run for run in runs if run not in failed], arguments.workers)
+    study.write(arguments.output, runs, failed, {"workers": arguments.workers})
+    (arguments.output / "README.md").write_text(table(study.read(arguments.output)))
+    print((arguments.output / "README.md").read_text())
+    return 1 if failed else 0
+
+
+def make_run(arguments: Arguments, family: str, candidate: str, seed: int) -> Run:
+    """One run of a candidate, from the task's settings whatever has been tuned already."""
+    changes = CANDIDATES[candidate]
+    setting = task_setting(arguments.task)
+    setting = configure("", family, setting, seed, arguments.steps, **changes)
+    where = arguments.folder / arguments.task / family / candidate.replace(" ", "_") / f"seed_{seed}"
+    return Run(arguments.task, f"{family}: {candidate}", seed, setting, where, arguments.episodes)
+
+
+def score(runs: list[Run], family: str, candidate: str) -> float:
+    """Mean evaluated return over the seeds; a run without one counts as the worst."""
+    found = [run.result() for run in runs if run.method == f"{family}: {candidate}"]
+    rows = [[r for r in f["evaluation"] if r["actions"] == "deterministic"] for f in found if f]
+    return float(np.mean([np.mean([r["return"] for r in each]) if each else -np.inf for each in rows]))
+
+
+def table(results: study.Study) -> str:
+    """Candidates x families: mean evaluated return, and how many seeds it is the mean of."""
+    (task,) = results.tasks
+    methods = [method.split(": ") for method in results.methods(task)]
+    families = list(dict.fromkeys(f for f, _ in methods))
+    candidates = list(dict.fromkeys(c for _, c in methods))
+    means = {
+        (f, c): results.goal_returns(task, f"{f}: {c}")[1].mean(axis=1)
+        for f in families
+        for c in candidates
+    }
+    lines = [["candidate", *families], ["---", *["---:"] * len(families)]]
+    for c in candidates:
+        lines.append([c])
+        for f in families:
+            seeds = len(means[f, c])
+            most = max(len(means[f, other]) for other in candidates)
+            rivals = [means[f, o].mean() for o in candidates if len(means[f, o]) == most]
+            text = f"{means[f, c].mean():.3f} ({seeds})"
+            lines[-1].append(f"**{text}**" if seeds == most and means[f, c].mean() == max(rivals) else text)
+    text = f"Made by `{results.about['command']}` ({results.about['revision']}): mean evaluated return of "
+    text += f"{task} and, in brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the "
+    text += f"best {KEPT} of a family got {len(MORE)} more. Bold: the winner among those.\n\n"
+    return text + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+if __name__ == "__main__":
+    sys.exit(main(tyro.cli(Arguments)))
