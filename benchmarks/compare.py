@@ -21,11 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import study
 import tyro
-from methods import configure
-from pool import execute_all
-from runs import Run, task_setting
+
+from comparison import study
+from comparison.methods import configure
+from comparison.pool import execute_all
+from comparison.run import Run, task_setting
 
 HERE = Path(__file__).parent
 
@@ -41,7 +42,7 @@ class Experiment:
 
     Attributes:
         tasks: names, or `module:function`.
-        methods: see `methods.py`.
+        methods: see `comparison/methods.py`.
         seeds: how many, from 0.
         steps: environment steps; None for what the task's settings say.
         config: changes of the configuration.

@@ -15,21 +15,17 @@ import functools
 import json
 import math
 import platform
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-import mujoco
-import tensordict
 import torch
-import torchrl
 import tyro
 from torchrl.envs.utils import ExplorationType
 
 import tasks
+from comparison.provenance import provenance
 from tasks.evaluation import evaluate
 from tasks.settings import SETTINGS, Setting
 from torchrl_sym.recipes import export_actor, load_actor, read_metrics, train
@@ -67,7 +63,7 @@ def main(arguments: Arguments) -> None:
     if not arguments.plot:
         setting = chosen(arguments)
         folders: list[Path] = []
-        for stage in (setting, *setting.then):
+        for stage in setting.stages:
             folder = arguments.folder / arguments.task / f"stage_{len(folders)}"
             make_env = functools.partial(tasks.make_env, arguments.task, num_threads=1, **stage.task)
             where = {"folder": folder, "start_from": folders[-1] if folders else None}
@@ -84,30 +80,18 @@ def chosen(arguments: Arguments) -> Setting:
     """The task's setting with what the command line replaces."""
     names = ("iterations", "num_envs", "augmentation", "seed")
     changes = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
-
-    def changed(setting: Setting) -> Setting:
-        config = dataclasses.replace(setting.config, **changes)
-        return dataclasses.replace(setting, config=config, then=tuple(map(changed, setting.then)))
-
-    return changed(SETTINGS[arguments.task])
+    return SETTINGS[arguments.task].replace(**changes)
 
 
 def report(arguments: Arguments, setting: Setting, folders: list[Path], output: Path) -> None:
     """Evaluate the last policy, and write everything that the pictures need."""
     export_actor(folders[-1], output)
     last = join([read_metrics(folder / "metrics.csv") for folder in folders], output / "metrics.csv")
-    stages = (setting, *setting.then)
-    result = {
-        "command": "python " + " ".join(sys.argv),
-        "stages": [{"config": dataclasses.asdict(s.config), "task": s.task} for s in stages],
+    result = provenance() | {
+        "stages": [{"config": dataclasses.asdict(s.config), "task": s.task} for s in setting.stages],
         "frames": last["frames"],
         "minutes": last["seconds"] / 60,
         "machine": f"{platform.machine()}, one process, one thread",
-        "revision": revision(),
-        "versions": {
-            "python": platform.python_version(),
-            **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
-        },
     }
     result["evaluation"] = {
         what: {**kwargs, **evaluation(arguments, output, kwargs)}
@@ -187,13 +171,6 @@ def evaluation(arguments: Arguments, output: Path, task: dict[str, Any]) -> dict
         rates = ", ".join(f"{goal} {rate:.1%}" for goal, rate in outcome.goal_successes.items())
         print(f"{task or 'task'}, {name}: success {rates}")
     return result
-
-
-def revision() -> str:
-    """The commit that made the results."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    out = subprocess.run(command, cwd=RESULTS.parent, capture_output=True, text=True)
-    return out.stdout.strip() or "unknown"
 
 
 def draw(output: Path) -> None:

@@ -4,7 +4,7 @@
 
 Figures: `training` (the paper's learning curves of return and symmetry loss), `log_prob` (its log action
 probabilities of augmented samples, original rule against naive), `initialization` (its study of initial
-weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a return, over steps and seconds).
+weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a return, over steps and time).
 Lines are interquartile means over seeds, bands their 95 % bootstrap intervals. `tables.md` has the numbers.
 """
 
@@ -16,11 +16,12 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from intervals import band, iqm
 from matplotlib.axes import Axes
-from methods import label, parts
-from study import Study, read
-from tables import seconds_per_step, steps_to, tables, threshold
+
+from comparison.intervals import band, iqm
+from comparison.methods import label, parts
+from comparison.study import Study, read
+from comparison.tables import seconds_per_step, steps_to, tables, threshold
 
 HERE = Path(__file__).parent
 COLORS = {
@@ -127,7 +128,7 @@ def log_prob(study: Study):
 
 
 def initialization(study: Study):
-    """Return and symmetry loss by the scale of the initial weights, with and without a small mirror loss."""
+    """Return and symmetry loss by the scale of the initial weights, without and with a mirror loss."""
     groups: dict[tuple[str, str], list[str]] = {}
     for task in study.tasks:
         scaled = {method.split("+init-")[0] for method in study.methods(task) if "+init-" in method}

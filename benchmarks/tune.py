@@ -4,7 +4,7 @@
 
 Every family (plain PPO, augmentation, mirror loss, naive augmentation) tries the same candidates with the
 same seeds; the best two get more seeds; the best mean return wins. The seeds are not those of the
-comparison. The winners are written down in `methods.TUNED` by hand.
+comparison. The winners are written down in `comparison.methods.TUNED` by hand.
 """
 
 import os
@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import study
 import tyro
-from methods import AUGMENTATION, configure
-from pool import execute_all
-from runs import Run, task_setting
+
+from comparison import study
+from comparison.methods import configure
+from comparison.pool import execute_all
+from comparison.run import Run, task_setting
 
 HERE = Path(__file__).parent
 FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
@@ -110,7 +111,9 @@ def table(results: study.Study) -> str:
             text = f"{means[f, c].mean():.3f} ({seeds})"
             lines[-1].append(f"**{text}**" if seeds == most and means[f, c].mean() == max(rivals) else text)
     text = f"Made by `{results.about['command']}` ({results.about['revision']}): mean evaluated return of "
-    text += f"{task} and, in brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the "
+    text += (
+        f"{task} and, in brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the "
+    )
     text += f"best {KEPT} of a family got {len(MORE)} more. Bold: the winner among those.\n\n"
     return text + "".join(f"| {' | '.join(line)} |\n" for line in lines)
 

@@ -13,8 +13,9 @@ import time
 import traceback
 from collections.abc import Sequence
 
-from runs import Run
 from tqdm import tqdm
+
+from comparison.run import Run
 
 POLL = 0.5  # seconds between two looks at the runs' files
 

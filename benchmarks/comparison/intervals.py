@@ -2,8 +2,8 @@
 
 The interquartile mean drops the lowest and the highest quarter: one seed that failed does not drown the
 others, as it would in a mean, and unlike a median it uses half of the data. Its interval, and that of a
-difference, is bootstrapped over seeds (95 %, percentiles), with a fixed generator, so that results are drawn
-alike every time. (Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS.)
+difference, is bootstrapped over seeds (95 %, percentiles), with a fixed generator, so that results are
+drawn alike every time. (Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS.)
 """
 
 from dataclasses import dataclass

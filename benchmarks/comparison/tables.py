@@ -1,9 +1,10 @@
 """The numbers of a comparison as Markdown: Table I of the paper, and how fast each method gets there."""
 
 import numpy as np
-from intervals import estimate, iqm
-from methods import label
-from study import Study
+
+from comparison.intervals import estimate, iqm
+from comparison.methods import label
+from comparison.study import Study
 
 SMOOTHING = 5  # logged iterations over which a training return is averaged
 SHARE = 0.9  # of the way from the first return to the best method's last: the threshold of efficiency
@@ -42,10 +43,11 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
             row += [f"{successes[method].mean():.1%}", f"{successes[method].mean(axis=0).min():.1%}"]
         rows.append(row)
     note = (
-        "*return*: mean over the equivalent goals, mean actions; *variation*: the largest difference between\n"
-        "two goals; both as interquartile mean over seeds with its 95 % bootstrap interval. *largest\n"
-        "variation*: that of the worst seed. *symmetry loss*: sum over the group of ||K_g[π(s)] − π(L_g[s])||²\n"
-        "on the states of the last iteration (interquartile mean of logarithms).\n"
+        "*return*: mean over the equivalent goals, mean actions; *variation*: the largest difference\n"
+        "between two goals; both as interquartile mean over seeds with its 95 % bootstrap interval.\n"
+        "*largest variation*: that of the worst seed. *symmetry loss*: sum over the group of the squared\n"
+        "distance of K_g[π(s)] from π(L_g[s]) on the states of the last iteration (interquartile mean of\n"
+        "logarithms).\n"
     )
     return markdown(rows) + "\n" + note
 
@@ -64,8 +66,8 @@ def efficiency_table(study: Study, task: str) -> str:
         rows.append([label(method), count, *known, f"{1 / cost:,.0f}"])
     note = (
         f"Until the training return, averaged over {SMOOTHING} logged iterations, reaches {goal:.2f}: "
-        f"{SHARE:.0%} of the way from\nits first value to the best method's last. Seeds that never do count as "
-        "infinite in the median. One process\nwith one thread per run.\n"
+        f"{SHARE:.0%} of\nthe way from its first value to the best method's last. Seeds that never do "
+        "count as infinite in\nthe median. One process with one thread per run.\n"
     )
     return markdown(rows) + "\n" + note
 

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from provenance import provenance
-from runs import Run
+
+from comparison.provenance import provenance
+from comparison.run import Run
 
 RUN = ("task", "method", "seed")
 EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")
@@ -51,7 +52,9 @@ def write(folder: Path, runs: Sequence[Run], failed: Sequence[Run], about: dict[
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [stage | {"config": {k: v for k, v in stage["config"].items() if k != "seed"}} for stage in stages]
+    return [
+        stage | {"config": {k: v for k, v in stage["config"].items() if k != "seed"}} for stage in stages
+    ]
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:

@@ -75,7 +75,9 @@ class Run:
         done, latest = 0, float("nan")
         for number in range(len(self.setting.stages)):
             table = self.folder / f"stage_{number}" / "metrics.csv"
-            lines = table.read_text().split("\n")[:-1] if table.exists() else []  # the last may be half written
+            lines = (
+                table.read_text().split("\n")[:-1] if table.exists() else []
+            )  # the last may be half written
             if len(lines) > 1:
                 done += len(lines) - 1
                 latest = float(next(csv.DictReader([lines[0], lines[-1]]))["return"])
@@ -120,7 +122,9 @@ class Run:
             try:
                 for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
                     pass
-            except FloatingPointError as error:  # a result like any other: the same seed would end here again
+            except (
+                FloatingPointError
+            ) as error:  # a result like any other: the same seed would end here again
                 outcome = f"diverged: {error}"
                 break
         curve = self.curve()

@@ -1,0 +1,139 @@
+"""Writes docs/results.md, and the tables in the README, from stored results: no number is typed.
+
+    python benchmarks/results_page.py
+
+In the README, what stands between `<!-- results: NAME -->` and `<!-- end -->` is replaced.
+"""
+
+import re
+import textwrap
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from comparison import claims
+from comparison.study import Study, read
+from comparison.tables import efficiency_table, table_1
+
+HERE = Path(__file__).parent
+STUDY = "paper-cartpole"
+README_METHODS = ["ppo", "loss-1", "aug-naive", "aug", "aug-random"]
+CAPTIONS = {
+    "training": "Training return and symmetry loss over environment steps (the paper's training figure).",
+    "goals": "Every seed's return from both starting sides: a long line is a policy with a favourite side.",
+    "log_prob": "Mean log-probability in the denominator of the update, over augmented samples, a line per "
+    "seed: the original rule keeps that of the original sample, the naive rule re-evaluates it on the copy "
+    "(the paper's log-probability figure).",
+    "initialization": "Initial weights of several scales (the paper's initialisation figure).",
+    "efficiency": "Share of seeds that have reached a return, over environment steps and over time.",
+}
+
+
+@dataclass
+class Arguments:
+    """Write the page of results and the tables of the README."""
+
+    results: Path = HERE / "results"
+    """Where results are stored."""
+    docs: Path = HERE.parent / "docs"
+    """Where results.md goes."""
+    readme: Path = HERE.parent / "README.md"
+    """The README."""
+
+
+def page(study: Study, tuning: str) -> str:
+    """docs/results.md: claims, Table I, figures, efficiency, how it was tuned."""
+    about = study.about
+    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
+    hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
+    figures = "\n".join(
+        f"![{name}](../benchmarks/plots/{STUDY}/{name}.png)\n\n{prose(f'*{caption}*')}\n"
+        for name, caption in CAPTIONS.items()
+    )
+    made = prose(f"""Made by `python benchmarks/results_page.py` from
+        [benchmarks/results](../benchmarks/results); a test compares. The runs: `{about["command"]}` at
+        {about["revision"]} ({versions}; {about["machine"]}, {about["workers"]} runs at a time, one thread
+        each; {len(study.curves)} runs, {hours:.1f} hours of one core in training). Draw again: `python
+        benchmarks/plot.py {STUDY}`.""")
+    rule = prose("""Two methods are compared by the difference of their interquartile means over seeds, with
+        its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the side that the paper
+        claims. *Different*: on the other side. *Not confirmed*: it contains zero. The paper's returns are not
+        comparable in size: it gives neither velocity limit nor episode length.""")
+    tuned = prose("""Every family of methods tried the same changes of the same settings with the same seeds,
+        which are not those above; the winner of a family is used for all its methods (`TUNED` in
+        `benchmarks/methods.py`). The weight of the mirror loss was varied in addition. The shape of the batch
+        was chosen before, for plain PPO and augmentation together: `tasks/settings.py`.""")
+    return f"""# Results
+
+{made}
+
+## The paper's claims on CartPole
+
+{rule}
+
+{claims.table(study)}
+## Table I
+
+{table_1(study, "cartpole")}
+## Figures
+
+Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
+
+{figures}
+## Efficiency
+
+{efficiency_table(study, "cartpole")}
+## How the methods were tuned
+
+{tuned}
+
+{tuning}
+## Robot tasks
+
+So far one seed each, with augmentation: [benchmarks/results/learn](../benchmarks/results/learn/README.md).
+"""
+
+
+def readme_block(study: Study) -> str:
+    """The README's table, and what it shows."""
+    plain, copies = (claims.variations(study, m) for m in ("ppo", "aug"))
+    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
+    seeds = " to ".join(map(str, sorted({len(study.seeds("cartpole", m)) for m in README_METHODS})))
+    text = prose(f"""Plain PPO has a favourite side in {(plain > claims.SWING).sum()} of {len(plain)} seeds, and
+        swings the pole all the way round from the other; with symmetric copies the worst seed differs by
+        {copies.max():.3f}. Every claim of the paper with evidence and verdict, also those that do not hold
+        here: [results](docs/results.md).""")
+    head = f"After {steps:.1f} million steps, {seeds} seeds per method:"
+    return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"
+
+
+def prose(text: str) -> str:
+    """A paragraph in lines of the repository's width."""
+    return textwrap.fill(" ".join(text.split()), 108, break_long_words=False, break_on_hyphens=False)
+
+
+def replace_blocks(text: str, blocks: dict[str, str]) -> str:
+    """A text with the content of its marked blocks replaced.
+
+    Raises:
+        ValueError: a block is not there.
+    """
+    for name, content in blocks.items():
+        pattern = re.compile(rf"(<!-- results: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not pattern.search(text):
+            raise ValueError(f"expected a block '<!-- results: {name} -->' ... '<!-- end -->', found none")
+        text = pattern.sub(lambda match, content=content: match[1] + content + match[2], text)
+    return text
+
+
+def main(arguments: Arguments) -> None:
+    study = read(arguments.results / STUDY)
+    tuning = (arguments.results / "tuning" / "README.md").read_text()
+    (arguments.docs / "results.md").write_text(page(study, tuning))
+    text = replace_blocks(arguments.readme.read_text(), {"cartpole": readme_block(study)})
+    arguments.readme.write_text(text)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
