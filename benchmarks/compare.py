@@ -5,9 +5,9 @@
     python benchmarks/compare.py --preset paper             # the robots as well: days on two cores
     python benchmarks/compare.py --tasks anymal_push --methods ppo aug-random --seeds 5
 
-Every run is a process of its own with one thread, as many at a time as there are cores. Kill it whenever you
-like: the same command goes on where it was and ends in the same results. A run that fails is reported and
-does not stop the others. Results go to benchmarks/results/NAME as tidy tables; `plot.py` draws them.
+Every run is a process of its own with one thread, as many at a time as there are cores. Kill it whenever
+you like: the same command goes on where it was and ends in the same results. A run that fails is reported
+and does not stop the others. Results go to benchmarks/results/NAME as tidy tables; `plot.py` draws them.
 
 Your own task is `--tasks module:function`, a function that takes `num_envs` and `seed` and returns an
 environment with a `symmetry`; hyper-parameters are a `SETTING` in its module, or `--config KEY=VALUE ...`.

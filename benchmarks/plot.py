@@ -168,15 +168,15 @@ def goals(study: Study):
     figure, axes = grid(1, len(study.tasks), 6.4, 4.2)
     markers = "><^vDs"
     for axis, task in zip(axes[0], study.tasks, strict=True):
-        methods = study.methods(task)
+        methods, legend_goals = study.methods(task), []
         for place, method in enumerate(methods):
             names, values = study.goal_returns(task, method)
-            offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else [0.0]
-            for x, row in zip(place + np.asarray(offsets), values, strict=True):
+            offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(len(values))
+            for x, row in zip(place + offsets, values, strict=True):
                 axis.plot([x, x], [row.min(), row.max()], color=color(method), linewidth=1, alpha=0.6)
                 for marker, value in zip(markers, row, strict=False):
                     axis.plot(x, value, marker, color=color(method), markersize=3.5, markeredgewidth=0)
-            legend_goals = names
+            legend_goals = names or legend_goals
         axis.set_xticks(
             range(len(methods)), [label(m) for m in methods], rotation=40, ha="right", fontsize=7.5
         )
@@ -193,6 +193,8 @@ def efficiency(study: Study):
         goal = threshold(study, task)
         for method in without(study.methods(task), naive=True, scales=True):
             reached = np.sort(steps_to(study, task, method, goal))
+            if not len(reached):
+                continue
             share = np.arange(1, len(reached) + 1) / len(reached)
             known = np.isfinite(reached)
             end = study.curve(task, method, "return")[0][-1]

@@ -56,14 +56,14 @@ def page(study: Study, tuning: str) -> str:
         {about["revision"]} ({versions}; {about["machine"]}, {about["workers"]} runs at a time, one thread
         each; {len(study.curves)} runs, {hours:.1f} hours of one core in training). Draw again: `python
         benchmarks/plot.py {STUDY}`.""")
-    rule = prose("""Two methods are compared by the difference of their interquartile means over seeds, with
-        its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the side that the paper
-        claims. *Different*: on the other side. *Not confirmed*: it contains zero. The paper's returns are not
-        comparable in size: it gives neither velocity limit nor episode length.""")
-    tuned = prose("""Every family of methods tried the same changes of the same settings with the same seeds,
-        which are not those above; the winner of a family is used for all its methods (`TUNED` in
-        `benchmarks/methods.py`). The weight of the mirror loss was varied in addition. The shape of the batch
-        was chosen before, for plain PPO and augmentation together: `tasks/settings.py`.""")
+    rule = prose("""Two methods are compared by the difference of their interquartile means over seeds,
+        with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the side that the
+        paper claims. *Different*: on the other side. *Not confirmed*: it contains zero. The paper's returns
+        are not comparable in size: it gives neither velocity limit nor episode length.""")
+    tuned = prose("""Every family of methods tried the same changes of the same settings with the same
+        seeds, which are not those above; the winner of a family is used for all its methods (`TUNED` in
+        `benchmarks/comparison/methods.py`). The weight of the mirror loss was varied in addition. The shape
+        of the batch was chosen before, for plain PPO and augmentation together: `tasks/settings.py`.""")
     return f"""# Results
 
 {made}
@@ -98,12 +98,13 @@ So far one seed each, with augmentation: [benchmarks/results/learn](../benchmark
 def readme_block(study: Study) -> str:
     """The README's table, and what it shows."""
     plain, copies = (claims.variations(study, m) for m in ("ppo", "aug"))
+    one_sided = f"{(plain > claims.SWING).sum()} of {len(plain)}"
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
     seeds = " to ".join(map(str, sorted({len(study.seeds("cartpole", m)) for m in README_METHODS})))
-    text = prose(f"""Plain PPO has a favourite side in {(plain > claims.SWING).sum()} of {len(plain)} seeds, and
-        swings the pole all the way round from the other; with symmetric copies the worst seed differs by
-        {copies.max():.3f}. Every claim of the paper with evidence and verdict, also those that do not hold
-        here: [results](docs/results.md).""")
+    text = prose(f"""Plain PPO has a favourite side in {one_sided} seeds, and swings the pole all the way
+        round from the other; with symmetric copies the worst seed differs by {copies.max():.3f}. Every
+        claim of the paper with evidence and verdict, also those that do not hold here:
+        [results](docs/results.md).""")
     head = f"After {steps:.1f} million steps, {seeds} seeds per method:"
     return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"
 

@@ -1,9 +1,9 @@
 """The compared methods, each a change of one task's settings.
 
 A name is a sum of parts: what happens to the data (`ppo`, `aug`, `aug-random`, `aug-naive`,
-`aug-naive-raw`), `loss-W` for a mirror loss of weight W in the paper's convention (a sum over the group and
-the action's entries), `init-S` for initial weights S times as large. So `aug+loss-0.1` is augmentation with a
-mirror loss, `loss-1` plain PPO with one, `aug+init-4` augmentation from large weights.
+`aug-naive-raw`), `loss-W` for a mirror loss of weight W in the paper's convention (a sum over the group
+and the action's entries), `init-S` for initial weights S times as large. So `aug+loss-0.1` is augmentation
+with a mirror loss, `loss-1` plain PPO with one, `aug+init-4` augmentation from large weights.
 """
 
 import dataclasses

@@ -1,8 +1,8 @@
 """Executes runs in parallel: one process each, a bar for each, and none stops the others.
 
-Processes are forked from a server that has imported everything once, so that a run starts in a fraction of a
-second. They report through their files alone (`Run.progress`), end with the process that started them, and
-may crash: what happened is in the run's `log.txt`.
+Processes are forked from a server that has imported everything once, so that a run starts in a fraction of
+a second. They report through their files alone (`Run.progress`), end with the process that started them,
+and may crash: what happened is in the run's `log.txt`.
 """
 
 import multiprocessing

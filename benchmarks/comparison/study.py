@@ -42,7 +42,7 @@ def write(folder: Path, runs: Sequence[Run], failed: Sequence[Run], about: dict[
         rows = result["evaluation"] or [{}]
         evaluated += [name | ended | row for row in rows]
         curve = run.curve()
-        every = math.ceil(len(curve) / POINTS)
+        every = max(1, math.ceil(len(curve) / POINTS))
         curves += [name | row for row in curve[::-every][::-1]]  # the last row is kept
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
@@ -102,14 +102,18 @@ class Study:
 
     def seeds(self, task: str, method: str) -> list[int]:
         """Seeds of a method."""
-        return [seed for t, m, seed in self.curves if (t, m) == (task, method)]
+        found = [row["seed"] for row in self.runs if (row["task"], row["method"]) == (task, method)]
+        return list(dict.fromkeys(found))
 
     def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
         """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
 
-        A run that diverged keeps its last value, so that it is not dropped from the average.
+        A run that diverged keeps its last value, so that it is not dropped from the average; one that
+        diverged at once has no curve.
         """
         columns = [c for (t, m, _), c in self.curves.items() if (t, m) == (task, method)]
+        if not columns:
+            return np.zeros(0), np.zeros((0, 0))
         longest = max(columns, key=lambda c: len(c["frames"]))["frames"]
         values = np.full((len(columns), len(longest)), np.nan)
         for row, c in zip(values, columns, strict=True):

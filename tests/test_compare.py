@@ -1,0 +1,154 @@
+"""benchmarks/compare.py from the outside: it draws everything, survives kills, and reports what failed."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FIGURES = {"training.png", "log_prob.png", "initialization.png", "goals.png", "efficiency.png"}
+TINY = ["--config", "num_envs=8", "horizon=25", "epochs=1", "minibatches=1", "checkpoint_interval=2"]
+TIMING = ("seconds",)
+
+# Tasks of a user: one whose processes die or fail for some seeds, one that is no BatchedEnv, one without
+# numbers to learn from.
+USER_TASKS = """
+import os
+import tasks
+from tasks.settings import Setting
+from torchrl.envs import RewardScaling, TransformedEnv
+from torchrl_sym.recipes import PPOConfig
+
+SETTING = Setting(PPOConfig(num_envs=4, horizon=8, epochs=1, minibatches=1, iterations=2))
+
+def make(num_envs, seed):
+    if num_envs > 1 and seed == 1:
+        os._exit(3)
+    if num_envs > 1 and seed == 2:
+        raise RuntimeError("no such seed")
+    return tasks.make_env("cartpole", num_envs=num_envs, num_threads=1, seed=seed, episode_seconds=0.2)
+
+def transformed(num_envs, seed):
+    return TransformedEnv(make(num_envs, 0), RewardScaling(0.0, 2.0))
+
+def lost(num_envs, seed):
+    return TransformedEnv(make(num_envs, 0), RewardScaling(float("nan"), 1.0))
+"""
+
+
+def command(folder: Path, *arguments: str) -> list[str]:
+    where = ["--folder", "runs", "--output", "results", "--plots", "plots", "--episodes", "2"]
+    return [sys.executable, str(ROOT / "benchmarks" / "compare.py"), *where, *arguments]
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
+
+
+def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
+    options = {"cwd": folder, "env": environment(), "capture_output": True, "text": True, "timeout": 500}
+    return subprocess.run(arguments, **options)
+
+
+def compare(folder: Path, *arguments: str, expected: int = 0) -> str:
+    result = run(command(folder, *arguments), folder)
+    assert result.returncode == expected, result.stdout[-2000:] + result.stderr[-3000:]
+    return result.stdout + result.stderr
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return [{k: v for k, v in row.items() if k not in TIMING} for row in csv.DictReader(file)]
+
+
+@pytest.mark.slow
+def test_smoke_draws_every_figure_of_every_task(tmp_path):
+    started = time.monotonic()
+    compare(tmp_path, "--preset", "smoke")
+    assert time.monotonic() - started < 300  # 180 s on two cores that have nothing else to do
+    drawn = {path.name: path.stat().st_size for path in (tmp_path / "plots" / "smoke").iterdir()}
+    assert set(drawn) == FIGURES | {"tables.md"}
+    assert all(drawn[name] > 10_000 for name in FIGURES)
+    about = json.loads((tmp_path / "results" / "smoke" / "study.json").read_text())
+    assert set(about["methods"]) == {"cartpole", "anymal_push", "anymal_climb", "trifinger_repose"}
+    assert {"aug-naive", "aug-naive-raw", "aug+init-4", "loss-10"} <= set(about["methods"]["cartpole"])
+    assert about["failed"] == []
+    assert about["command"].endswith("--preset smoke")
+
+
+def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    what = ["--methods", "ppo", "aug+loss-1", "--seeds", "1", "--steps", str(8 * 25 * 12), *TINY]
+    for folder in (whole, killed):
+        folder.mkdir()
+    compare(whole, *what)
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen(command(killed, *what), cwd=killed, env=environment(), **quiet)
+    table = killed / "runs" / "custom" / "cartpole" / "ppo" / "seed_0" / "stage_0" / "metrics.csv"
+    while not table.exists() or len(table.read_text().splitlines()) < 5:
+        assert process.poll() is None
+        time.sleep(0.05)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not (killed / "results").exists()
+    time.sleep(1.0)
+    size = table.stat().st_size
+    time.sleep(1.5)
+    assert table.stat().st_size == size, "the workers outlived their comparison"
+    compare(killed, *what)
+    for name in ("runs.csv", "curves.csv"):
+        assert rows(whole / "results/custom" / name) == rows(killed / "results/custom" / name)
+    before = (killed / "results/custom/curves.csv").read_text()
+    compare(killed, *what)  # nothing is left to do
+    assert (killed / "results/custom/curves.csv").read_text() == before
+
+
+def test_what_fails_is_reported_and_stops_nothing(tmp_path):
+    (tmp_path / "mine.py").write_text(USER_TASKS)
+    output = compare(tmp_path, "--tasks", "mine:make", "--methods", "aug", "--seeds", "4", expected=1)
+    assert "FAILED: mine:make aug 1" in output
+    assert "FAILED: mine:make aug 2" in output
+    assert "exit code 3" in output
+    assert "RuntimeError: no such seed" in output
+    about = json.loads((tmp_path / "results" / "custom" / "study.json").read_text())
+    assert about["failed"] == ["mine:make aug 1", "mine:make aug 2"]
+    assert {row["seed"] for row in rows(tmp_path / "results" / "custom" / "runs.csv")} == {"0", "3"}
+    assert about["methods"]["mine:make"]["aug"][0]["config"]["num_envs"] == 4  # from its SETTING
+
+
+def test_other_environments_and_runs_that_diverge(tmp_path):
+    (tmp_path / "mine.py").write_text(USER_TASKS)
+    compare(tmp_path, "--tasks", "mine:transformed", "mine:lost", "--methods", "ppo", "--seeds", "1")
+    found = {row["task"]: row for row in rows(tmp_path / "results" / "custom" / "runs.csv")}
+    assert found["mine:lost"]["outcome"] == "diverged"
+    assert found["mine:lost"]["return"] == ""
+    assert found["mine:transformed"]["goal"] == "all"
+    assert -2 * 0.2 * np.pi <= float(found["mine:transformed"]["return"]) < 0
+    assert "| PPO | 1 (1 diverged) | - |" in (tmp_path / "plots" / "custom" / "tables.md").read_text()
+
+
+def test_a_wrong_method_is_refused_before_anything_starts(tmp_path):
+    assert "expected a method made of" in compare(tmp_path, "--methods", "agu", expected=1)
+    assert "expected KEY=VALUE" in compare(tmp_path, "--config", "num_envs", expected=1)
+    assert not (tmp_path / "runs").exists()
+
+
+def test_tuning_gives_every_family_the_same(tmp_path):
+    script = str(ROOT / "benchmarks" / "tune.py")
+    tiny = ["--families", "ppo", "aug", "--candidates", "3", "--steps", "1", "--episodes", "1"]
+    where = ["--folder", "runs", "--output", "results"]
+    result = run([sys.executable, script, *tiny, *where], tmp_path)
+    assert result.returncode == 0, result.stderr[-3000:]
+    runs = {(row["method"], row["seed"]) for row in rows(tmp_path / "results" / "runs.csv")}
+    for family in ("ppo", "aug"):
+        assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 3 * 2 + 2 * 3
+    lines = (tmp_path / "results" / "README.md").read_text().splitlines()
+    assert "| candidate | ppo | aug |" in lines
+    assert "".join(lines).count("**") == 4  # one winner per family
