@@ -22,7 +22,8 @@ from tqdm import tqdm
 
 import tasks
 from tasks.evaluation import Evaluation, evaluate
-from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train
+from tasks.settings import SETTINGS
+from torchrl_sym.recipes import load_actor, read_metrics, train
 
 METHODS = {"PPO": "none", "PPO + augmentation": "all"}
 COLORS = {"PPO": "tab:orange", "PPO + augmentation": "tab:blue"}
@@ -34,8 +35,8 @@ class Arguments:
 
     seeds: int = 3
     """Seeds per method."""
-    iterations: int = 350
-    """Iterations per run, of 8192 steps each; the effect on the return shows after about 300."""
+    iterations: int = 175
+    """Iterations per run, of 16384 steps each; the effect on the return shows after about 150."""
     episodes: int = 500
     """Evaluation episodes per starting side."""
     workers: int = os.cpu_count() or 1
@@ -51,8 +52,10 @@ def run(method: str, seed: int, iterations: int, folder: Path, progress=None) ->
     torch.set_num_threads(1)
     make_env = functools.partial(tasks.make_env, "cartpole", num_threads=1)
     symmetry = make_env(num_envs=1, seed=0).symmetry
-    config = PPOConfig(augmentation=METHODS[method], seed=seed, iterations=iterations)
-    for _ in train(config, make_env, symmetry, folder=folder):
+    setting = SETTINGS["cartpole"].replace(
+        augmentation=METHODS[method], seed=seed, iterations=iterations, checkpoint_interval=1
+    )
+    for _ in train(setting.config, make_env, symmetry, folder=folder):
         if progress is not None:
             progress.put(1)
 

@@ -14,7 +14,7 @@ import torch
 from torchrl.envs import GymEnv, SerialEnv
 
 import tasks
-from torchrl_sym import PointGroup, Symmetry
+from torchrl_sym import MirrorLoss, PointGroup, Symmetry
 from torchrl_sym.recipes import PPOConfig, RunFolder, load_actor, read_metrics, train
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.ppo import make_networks
@@ -258,6 +258,21 @@ def test_symmetry_metrics_of_an_equivariant_policy(symmetry):
     metrics = symmetry_metrics(actor, symmetry, data)
     assert metrics["mirror_loss"] < 1e-12
     assert metrics["log_prob"] == pytest.approx(metrics["log_prob_copies"], abs=1e-6)
+
+
+def test_symmetry_metrics_are_the_mirror_loss_and_the_copies_probabilities(symmetry):
+    env = MAKE_ENV(num_envs=8, seed=0)
+    actor, _ = make_networks(TINY, env, symmetry)
+    with torch.no_grad():
+        data = env.rollout(5, actor)
+        expected = float(MirrorLoss(actor, symmetry=symmetry)(data)["loss_mirror"])
+        mirrored = symmetry(data.select("observation", "action"), "reflect-x")
+        copies = actor.get_dist(mirrored.select("observation")).log_prob(mirrored["action"])
+    metrics = symmetry_metrics(actor, symmetry, data)
+    assert expected > 1e-4
+    assert metrics["mirror_loss"] == pytest.approx(expected, rel=1e-5)
+    assert metrics["log_prob"] == pytest.approx(float(data["action_log_prob"].mean()), rel=1e-5)
+    assert metrics["log_prob_copies"] == pytest.approx(float(copies.mean()), rel=1e-5)
 
 
 def test_episode_returns_cross_batches_and_leave_out_the_first():

@@ -122,6 +122,19 @@ def test_the_page_about_the_tasks_is_what_the_code_says(tmp_path):
     assert [picture for picture in pictures if not (docs / picture).exists()] == []
 
 
+def test_figures_and_pages_follow_from_the_stored_results(tmp_path):
+    run("benchmarks/plot.py", "paper-cartpole", "--plots", tmp_path / "plots")
+    drawn, stored = tmp_path / "plots/paper-cartpole", ROOT / "benchmarks/plots/paper-cartpole"
+    assert (drawn / "tables.md").read_text() == (stored / "tables.md").read_text()
+    assert {path.name for path in drawn.iterdir()} == {path.name for path in stored.iterdir()}
+    readme = tmp_path / "README.md"
+    readme.write_text(re.sub(r"(?<=-->\n)\|?[^<]*(?=<!-- end)", "", (ROOT / "README.md").read_text()))
+    run("benchmarks/results_page.py", "--docs", tmp_path, "--readme", readme)
+    advice = "run python benchmarks/plot.py and benchmarks/results_page.py"
+    assert (tmp_path / "results.md").read_text() == (ROOT / "docs/results.md").read_text(), advice
+    assert readme.read_text() == (ROOT / "README.md").read_text(), advice
+
+
 @pytest.mark.slow
 def test_speed_writes_its_figures(tmp_path):
     figures = tmp_path / "speed.json"

@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import EnvBase
 
-from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.mirror_loss import deterministic_action, squared_distance
 from torchrl_sym.symmetry import Symmetry
 
 _MAX_ROWS = 2048  # rows on which the symmetry metrics are evaluated
@@ -76,10 +76,13 @@ def symmetry_metrics(
     rows = data.select(*actor.in_keys, "action").reshape(-1)
     rows = rows[:: math.ceil(len(rows) / _MAX_ROWS)]
     orbit = symmetry.orbit(rows)
-    log_prob = actor.get_dist(orbit.select(*actor.in_keys)).log_prob(orbit["action"])  # (N, rows)
+    dist = actor.get_dist(orbit.select(*actor.in_keys))
+    log_prob = dist.log_prob(orbit["action"])  # (N, rows)
     copies = log_prob[1:] if len(log_prob) > 1 else log_prob
+    action = deterministic_action(dist)  # pi(L_g[s])
+    error = squared_distance(action, symmetry["action"].orbit(action[0]))
     return {
-        "mirror_loss": float(MirrorLoss(actor, symmetry=symmetry)(rows)["loss_mirror"]),
+        "mirror_loss": float(error.sum(0).mean()),
         "log_prob": float(log_prob[0].mean()),
         "log_prob_copies": float(copies.mean()),
     }
