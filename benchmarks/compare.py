@@ -31,7 +31,6 @@ from comparison.run import Run, task_setting
 HERE = Path(__file__).parent
 
 MAIN = ("ppo", "aug", "aug-random", "loss-0.1", "loss-1", "loss-10", "aug+loss-0.1")
-NAIVE = ("aug-naive", "aug-naive-raw")
 SCALES = ("aug+init-0.1", "aug+init-4", "aug+loss-0.1+init-4")
 ROBOTS = ("ppo", "aug", "aug-random", "loss-0.1", "loss-1", "loss-10", "aug+loss-0.1")
 
@@ -57,18 +56,20 @@ class Experiment:
 
 _TINY = {"num_envs": 32, "horizon": 50, "epochs": 1, "minibatches": 2}
 _CARTPOLE = (
-    Experiment(("cartpole",), MAIN + NAIVE + SCALES, 10),
-    Experiment(("cartpole",), ("ppo", "aug"), 20),  # which one is faster takes more seeds to decide
+    Experiment(("cartpole",), (*MAIN, "aug-naive", *SCALES), 10),
+    Experiment(("cartpole",), ("aug-naive-raw",), 5),
 )
+_DECISIVE = (*_CARTPOLE, Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 30))
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
-        Experiment(("cartpole",), MAIN + NAIVE + SCALES, 2, 32 * 50 * 12, _TINY),
+        Experiment(("cartpole",), (*MAIN, "aug-naive", "aug-naive-raw", *SCALES), 2, 32 * 50 * 12, _TINY),
         Experiment(("anymal_push", "anymal_climb", "trifinger_repose"), ("ppo", "aug"), 1, 3200, _TINY),
     ),
     "paper-cartpole": _CARTPOLE,
+    "paper-cartpole-seeds": _DECISIVE,  # which method is faster takes more seeds to decide
     "paper": (
-        *_CARTPOLE,
+        *_DECISIVE,
         Experiment(("anymal_push",), ROBOTS, 5),
         Experiment(("anymal_climb", "trifinger_repose"), ROBOTS, 3),
     ),
@@ -79,7 +80,7 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
 class Arguments:
     """Compare methods, then draw figures and tables."""
 
-    preset: Literal["smoke", "paper-cartpole", "paper"] | None = None
+    preset: Literal["smoke", "paper-cartpole", "paper-cartpole-seeds", "paper"] | None = None
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
     tasks: tuple[str, ...] = ("cartpole",)
     """Names of tasks, or module:function."""
@@ -113,7 +114,8 @@ def main(arguments: Arguments) -> int:
     import plot  # every run's process imports this file, and has no use for matplotlib and scipy
 
     name = arguments.name or arguments.preset or "custom"
-    runs = make_runs(arguments, arguments.folder / name)
+    shared = "paper" if (arguments.preset or "").startswith("paper") else name  # they have runs in common
+    runs = make_runs(arguments, arguments.folder / shared)
     failed = execute_all(runs, arguments.workers)
     about = {"workers": arguments.workers, "threads": arguments.threads, "episodes": arguments.episodes}
     study.write(arguments.output / name, runs, failed, about)

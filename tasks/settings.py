@@ -113,7 +113,7 @@ _TRIFINGER = PPOConfig(
     checkpoint_interval=20,
 )
 
-# Twice the recipe's default of simulations: two thirds of the time per step, since every call of TorchRL and
+# Twice the recipe's default of simulations: two thirds of the time per step, since every call of TorchRL or
 # of the networks has a constant cost, and no worse per step (3 seeds each, with and without copies). With
 # 1024 x 16 it is another seventh faster, but plain PPO learned less.
 _CARTPOLE = PPOConfig(
