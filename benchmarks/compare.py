@@ -32,7 +32,6 @@ HERE = Path(__file__).parent
 
 MAIN = ("ppo", "aug", "aug-random", "loss-0.1", "loss-1", "loss-10", "aug+loss-0.1")
 SCALES = ("aug+init-0.1", "aug+init-4", "aug+loss-0.1+init-4")
-ROBOTS = ("ppo", "aug", "aug-random", "loss-0.1", "loss-1", "loss-10", "aug+loss-0.1")
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,8 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     "paper-cartpole-seeds": _DECISIVE,  # which method is faster takes more seeds to decide
     "paper": (
         *_DECISIVE,
-        Experiment(("anymal_push",), ROBOTS, 5),
-        Experiment(("anymal_climb", "trifinger_repose"), ROBOTS, 3),
+        Experiment(("anymal_push",), MAIN, 5),
+        Experiment(("anymal_climb", "trifinger_repose"), MAIN, 3),
     ),
 }
 
