@@ -3,7 +3,7 @@
     python benchmarks/tune.py                        # CartPole: about 40 minutes on two cores
 
 Every family (plain PPO, augmentation, mirror loss, naive augmentation) tries the same candidates with the
-same seeds; the best two get more seeds; the best mean return wins. The seeds are not those of the
+same seeds; the best three get more seeds; the best mean return wins. The seeds are not those of the
 comparison. The winners are written down in `comparison.methods.TUNED` by hand.
 """
 
@@ -24,7 +24,7 @@ from comparison.run import Run, task_setting
 HERE = Path(__file__).parent
 FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
 FIRST, MORE = (100, 101), (102, 103, 104)  # seeds of both rounds
-KEPT = 2  # candidates per family that get the second round's seeds
+KEPT = 3  # candidates per family that get the second round's seeds
 
 # What is varied around the task's settings, one at a time. Batches and networks stay the same, so
 # that all methods cost alike.

@@ -148,7 +148,7 @@ def test_tuning_gives_every_family_the_same(tmp_path):
     assert result.returncode == 0, result.stderr[-3000:]
     runs = {(row["method"], row["seed"]) for row in rows(tmp_path / "results" / "runs.csv")}
     for family in ("ppo", "aug"):
-        assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 3 * 2 + 2 * 3
+        assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 3 * 2 + 3 * 3
     lines = (tmp_path / "results" / "README.md").read_text().splitlines()
     assert "| candidate | ppo | aug |" in lines
     assert "".join(lines).count("**") == 4  # one winner per family
