@@ -32,7 +32,14 @@ LABELS = {
 
 # What `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as
 # many runs each (results/tuning); the rest is `tasks.settings`.
-TUNED: dict[str, dict[str, dict[str, Any]]] = {}
+TUNED: dict[str, dict[str, dict[str, Any]]] = {
+    "cartpole": {
+        "ppo": {"desired_kl": 0.005},
+        "aug": {"adapt_every": "iteration"},
+        "loss": {"desired_kl": 0.02},
+        "aug-naive": {"desired_kl": 0.02},
+    },
+}
 
 
 def parts(method: str) -> tuple[str, float, float]:
