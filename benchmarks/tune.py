@@ -68,7 +68,7 @@ def main(arguments: Arguments) -> int:
         best = sorted(names, key=lambda c: -score(runs, f, c))[:KEPT]
         runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
     failed += execute_all([run for run in runs if run not in failed], arguments.workers)
-    study.write(arguments.output, runs, failed, {"workers": arguments.workers})
+    study.write(arguments.output, runs, failed, {"workers": arguments.workers}, points=10)
     (arguments.output / "README.md").write_text(table(study.read(arguments.output)))
     print((arguments.output / "README.md").read_text())
     return 1 if failed else 0

@@ -25,11 +25,25 @@ CURVE = (
     *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
     *("std", "learning_rate", "kl", "success", "level", "phase"),
 )
-POINTS = 210  # rows per curve that are kept, at most
+POINTS = 105  # rows per curve that are kept, at most
 
 
-def write(folder: Path, runs: Sequence[Run], failed: Sequence[Run], about: dict[str, Any]) -> None:
-    """Write the results of all finished runs."""
+def write(
+    folder: Path,
+    runs: Sequence[Run],
+    failed: Sequence[Run],
+    about: dict[str, Any],
+    points: int = POINTS,
+) -> None:
+    """Write the results of all finished runs.
+
+    Args:
+        folder: where to.
+        runs: all runs; those that have no result are left out.
+        failed: runs that failed.
+        about: what else goes into `study.json`.
+        points: rows per curve that are kept, at most; the last one always is.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     evaluated, curves, methods = [], [], {}
     for run in runs:
@@ -42,7 +56,7 @@ def write(folder: Path, runs: Sequence[Run], failed: Sequence[Run], about: dict[
         rows = result["evaluation"] or [{}]
         evaluated += [name | ended | row for row in rows]
         curve = run.curve()
-        every = max(1, math.ceil(len(curve) / POINTS))
+        every = max(1, math.ceil(len(curve) / points))
         curves += [name | row for row in curve[::-every][::-1]]  # the last row is kept
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
