@@ -2,6 +2,7 @@
 
     python benchmarks/compare.py --preset smoke             # everything once, tiny: under 3 minutes
     python benchmarks/compare.py --preset paper-cartpole    # CartPole in full: under an hour on two cores
+    python benchmarks/compare.py --preset paper-cartpole-30 # half an hour more: 30 seeds where it matters
     python benchmarks/compare.py --preset paper             # the robots as well: days on two cores
     python benchmarks/compare.py --tasks anymal_push --methods ppo aug-random --seeds 5
 
@@ -14,6 +15,7 @@ environment with a `symmetry`; hyper-parameters are a `SETTING` in its module, o
 """
 
 import ast
+import dataclasses
 import os
 import sys
 from collections.abc import Sequence
@@ -24,9 +26,10 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from comparison import study
-from comparison.methods import configure
+from comparison.methods import METHOD_FIELDS, configure
 from comparison.pool import execute_all
 from comparison.run import Run, task_setting
+from torchrl_sym.recipes import PPOConfig
 
 HERE = Path(__file__).parent
 
@@ -44,6 +47,7 @@ class Experiment:
         seeds: how many, from 0.
         steps: environment steps; None for what the task's settings say.
         config: changes of the configuration.
+        episodes: evaluation episodes per goal.
     """
 
     tasks: tuple[str, ...]
@@ -51,6 +55,7 @@ class Experiment:
     seeds: int
     steps: int | None = None
     config: dict[str, Any] = field(default_factory=dict)
+    episodes: int = 500
 
 
 _TINY = {"num_envs": 32, "horizon": 50, "epochs": 1, "minibatches": 2}
@@ -58,15 +63,21 @@ _CARTPOLE = (
     Experiment(("cartpole",), (*MAIN, "aug-naive", *SCALES), 10),
     Experiment(("cartpole",), ("aug-naive-raw",), 5),
 )
-_DECISIVE = (*_CARTPOLE, Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 30))
+_DECISIVE = (
+    *_CARTPOLE,
+    Experiment(("cartpole",), ("aug-naive-raw",), 10),
+    Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 30),
+)
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
-        Experiment(("cartpole",), (*MAIN, "aug-naive", "aug-naive-raw", *SCALES), 2, 32 * 50 * 12, _TINY),
-        Experiment(("anymal_push", "anymal_climb", "trifinger_repose"), ("ppo", "aug"), 1, 3200, _TINY),
+        Experiment(
+            ("cartpole",), (*MAIN, "aug-naive", "aug-naive-raw", *SCALES), 2, 32 * 50 * 12, _TINY, 4
+        ),
+        Experiment(("anymal_push", "anymal_climb", "trifinger_repose"), ("ppo", "aug"), 1, 3200, _TINY, 4),
     ),
     "paper-cartpole": _CARTPOLE,
-    "paper-cartpole-seeds": _DECISIVE,  # which method is faster takes more seeds to decide
+    "paper-cartpole-30": _DECISIVE,  # which method is faster takes more seeds to decide
     "paper": (
         *_DECISIVE,
         Experiment(("anymal_push",), MAIN, 5),
@@ -79,20 +90,18 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
 class Arguments:
     """Compare methods, then draw figures and tables."""
 
-    preset: Literal["smoke", "paper-cartpole", "paper-cartpole-seeds", "paper"] | None = None
+    preset: Literal["smoke", "paper-cartpole", "paper-cartpole-30", "paper"] | None = None
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
     tasks: tuple[str, ...] = ("cartpole",)
     """Names of tasks, or module:function."""
     methods: tuple[str, ...] = ("ppo", "aug")
     """ppo, aug, aug-random, aug-naive, aug-naive-raw, loss-W, init-S, and sums of them."""
     seeds: int = 5
-    """Seeds per method."""
-    first_seed: int = 0
-    """The first of them."""
+    """Seeds per method, from 0: with more of them later, the first are not trained again."""
     steps: int | None = None
     """Environment steps per run, instead of the task's settings."""
     config: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
-    """Changes of PPOConfig for all runs, such as num_envs=64 hidden=(64,64)."""
+    """Changes of PPOConfig for all runs, such as num_envs=64 'hidden=(64,64)'."""
     episodes: int = 500
     """Evaluation episodes per goal."""
     workers: int = os.cpu_count() or 1
@@ -116,52 +125,77 @@ def main(arguments: Arguments) -> int:
     shared = "paper" if (arguments.preset or "").startswith("paper") else name  # they have runs in common
     runs = make_runs(arguments, arguments.folder / shared)
     failed = execute_all(runs, arguments.workers)
-    about = {"workers": arguments.workers, "threads": arguments.threads, "episodes": arguments.episodes}
-    study.write(arguments.output / name, runs, failed, about)
-    if len(failed) == len(runs):
-        print("every run failed; nothing to draw")
-        return 1
-    for path in plot.draw_all(arguments.output / name, arguments.plots / name):
-        print(f"wrote {path}")
     for run in failed:
         print(f"FAILED: {run} (see {run.folder / 'log.txt'})")
+    if len(failed) == len(runs):
+        print("every run failed; there is nothing to write")
+        return 1
+    about = {"workers": arguments.workers, "threads": arguments.threads}
+    study.write(arguments.output / name, runs, failed, about)
+    for path in plot.draw_all(arguments.output / name, arguments.plots / name):
+        print(f"wrote {path}")
     return 1 if failed else 0
 
 
 def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
     """All runs, seed by seed, so that an interrupted comparison has some seeds of every method."""
-    config = dict(parse(text) for text in arguments.config)
-    if arguments.preset is not None:
-        experiments: Sequence[Experiment] = PRESETS[arguments.preset]
-    else:
-        a = arguments
-        experiments = (Experiment(a.tasks, a.methods, a.seeds, a.steps, config),)
     runs: dict[Path, Run] = {}  # by folder: experiments may overlap
-    for experiment in experiments:
-        for seed in range(arguments.first_seed, arguments.first_seed + experiment.seeds):
+    for experiment in chosen(arguments):
+        for seed in range(experiment.seeds):
             for task in experiment.tasks:
                 setting = task_setting(task)
                 for method in experiment.methods:
                     changed = configure(task, method, setting, seed, experiment.steps, **experiment.config)
                     where = folder / task.replace(":", ".") / method / f"seed_{seed}"
-                    episodes = 4 if arguments.preset == "smoke" else arguments.episodes
-                    runs[where] = Run(task, method, seed, changed, where, episodes, arguments.threads)
+                    more = (experiment.episodes, arguments.threads)
+                    runs[where] = Run(task, method, seed, changed, where, *more)
     return list(runs.values())
+
+
+def chosen(arguments: Arguments) -> Sequence[Experiment]:
+    """The experiments that the command line asks for.
+
+    Raises:
+        ValueError: options that contradict each other, or a number that is not positive.
+    """
+    for name in ("seeds", "steps", "episodes", "workers", "threads"):
+        value = getattr(arguments, name)
+        if value is not None and value < 1:
+            raise ValueError(f"expected --{name} of at least 1, got {value}")
+    if arguments.preset is None:
+        a = arguments
+        config = dict(parse(text) for text in a.config)
+        return [Experiment(a.tasks, a.methods, a.seeds, a.steps, config, a.episodes)]
+    fixed = ("tasks", "methods", "seeds", "steps", "config", "episodes")
+    given = [name for name in fixed if getattr(arguments, name) != getattr(Arguments(), name)]
+    if given:
+        raise ValueError(
+            f"expected a preset alone, got --preset {arguments.preset} and {given}, which it fixes; leave "
+            "out one or the other"
+        )
+    return PRESETS[arguments.preset]
 
 
 def parse(text: str) -> tuple[str, Any]:
     """A change of the configuration, `KEY=VALUE`, the value in Python's notation or plain text.
 
     Raises:
-        ValueError: there is no equals sign.
+        ValueError: not of this form, no such field, a field that is the method's, or a wrong type.
     """
+    fields = {field.name: field.default for field in dataclasses.fields(PPOConfig)}
+    free = sorted(fields.keys() - METHOD_FIELDS)
     key, equals, value = text.partition("=")
-    if not equals:
-        raise ValueError(f"expected KEY=VALUE, such as num_envs=64, got {text!r}")
+    if not equals or key not in free:
+        raise ValueError(f"expected KEY=VALUE, such as num_envs=64, with a key of {free}, got {text!r}")
     try:
-        return key, ast.literal_eval(value)
+        parsed = ast.literal_eval(value)
     except (ValueError, SyntaxError):
-        return key, value
+        parsed = value
+    default = fields[key]
+    kind = (int, float, type(None)) if isinstance(default, float) or default is None else type(default)
+    if not isinstance(parsed, kind):
+        raise ValueError(f"expected {key} like {default!r}, got {value!r}")
+    return key, parsed
 
 
 if __name__ == "__main__":

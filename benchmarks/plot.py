@@ -1,6 +1,6 @@
 """Draws every figure and table of a comparison from its stored results alone.
 
-    python benchmarks/plot.py paper-cartpole
+    python benchmarks/plot.py paper-cartpole-30
 
 Figures: `training` (the paper's learning curves of return and symmetry loss), `log_prob` (its log action
 probabilities of augmented samples, original rule against naive), `initialization` (its study of initial
@@ -106,7 +106,7 @@ def training(study: Study):
 
 
 def log_prob(study: Study):
-    """Log-probabilities that the update divides by, averaged over augmented samples, every seed a line."""
+    """Log-probabilities in the denominator, mean over augmented samples; a cross where a seed diverged."""
     rules = {"aug": "log_prob", "aug-naive": "log_prob_copies", "aug-naive-raw": "log_prob_copies"}
     shown = [task for task in study.tasks if {"aug", "aug-naive"} <= set(study.methods(task))]
     if not shown:
@@ -116,8 +116,12 @@ def log_prob(study: Study):
         for method, column in rules.items():
             if method not in study.methods(task):
                 continue
-            steps, values = study.curve(task, method, column)
-            top.plot(steps, values.T, color=color(method), linewidth=0.8, alpha=0.8)
+            for (t, m, seed), own in study.curves.items():
+                if (t, m) == (task, method):
+                    style = {"color": color(method), "linewidth": 0.8, "alpha": 0.8}
+                    top.plot(own["frames"] / 1e6, own[column], **style)
+                    if seed in study.diverged(task, method):
+                        top.plot(own["frames"][-1] / 1e6, own[column][-1], "x", **style)
             top.plot([], [], color=color(method), label=label(method))
             draw_curve(bottom, study, task, method, "return")
         top.set_yscale("symlog", linthresh=10)
@@ -228,7 +232,7 @@ def legend(axis: Axes) -> None:
 class Arguments:
     """Draw figures and tables from stored results."""
 
-    name: tyro.conf.Positional[str] = "paper-cartpole"
+    name: tyro.conf.Positional[str] = "paper-cartpole-30"
     """What the results are called."""
     results: Path = HERE / "results"
     """Where results are, in a folder of their name."""

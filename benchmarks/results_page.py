@@ -17,7 +17,7 @@ from comparison.study import Study, read
 from comparison.tables import efficiency_table, table_1
 
 HERE = Path(__file__).parent
-STUDY = "paper-cartpole"
+STUDY = "paper-cartpole-30"
 README_METHODS = ["ppo", "loss-1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {
     "training": "Training return and symmetry loss over environment steps (the paper's training figure).",
@@ -53,17 +53,20 @@ def page(study: Study, tuning: str) -> str:
     )
     made = prose(f"""Made by `python benchmarks/results_page.py` from
         [benchmarks/results](../benchmarks/results); a test compares. The runs: `{about["command"]}` at
-        {about["revision"]} ({versions}; {about["machine"]}, {about["workers"]} runs at a time, one thread
-        each; {len(study.curves)} runs, {hours:.1f} hours of one core in training). Draw again: `python
-        benchmarks/plot.py {STUDY}`.""")
-    rule = prose("""Two methods are compared by the difference of their interquartile means over seeds,
-        with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the side that the
-        paper claims. *Different*: on the other side. *Not confirmed*: it contains zero. The paper's returns
-        are not comparable in size: it gives neither velocity limit nor episode length.""")
-    tuned = prose("""Every family of methods tried the same changes of the same settings with the same
-        seeds, which are not those above; the winner of a family is used for all its methods (`TUNED` in
-        `benchmarks/comparison/methods.py`). The weight of the mirror loss was varied in addition. The shape
-        of the batch was chosen before, for plain PPO and augmentation together: `tasks/settings.py`.""")
+        {", ".join(about["revisions"])} ({versions}; {about["machine"]}, {about["workers"]} runs at a
+        time, one thread each; {len(study.curves)} runs, {hours:.1f} hours of one core in training).
+        Draw again: `python benchmarks/plot.py {STUDY}`.""")
+    rule = prose("""Two methods are compared by the difference of their interquartile means
+        over seeds, with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the
+        side that the paper claims. *Different*: on the other side. *Not confirmed*: it contains zero.
+        That something gains nothing is confirmed if the whole interval lies below a margin. Counts of
+        seeds are compared by Fisher's exact test at 5 %. The paper's returns are not comparable in
+        size: it gives neither velocity limit nor episode length.""")
+    tuned = prose("""Every family of methods tried the same changes of the same settings with
+        the same seeds, which are not those above; the winner of a family is used for all its methods
+        (`TUNED` in `benchmarks/comparison/methods.py`). The weight of the mirror loss was varied in
+        addition. The shape of the batch was chosen before, for plain PPO and augmentation together:
+        `tasks/settings.py`.""")
     return f"""# Results
 
 {made}
@@ -101,9 +104,10 @@ def readme_block(study: Study) -> str:
     one_sided = f"{(plain > claims.SWING).sum()} of {len(plain)}"
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
     seeds = " to ".join(map(str, sorted({len(study.seeds("cartpole", m)) for m in README_METHODS})))
-    text = prose(f"""Plain PPO has a favourite side in {one_sided} seeds, and swings the pole all the way
-        round from the other; with symmetric copies the worst seed differs by {copies.max():.3f}. Every
-        claim of the paper with evidence and verdict, also those that do not hold here:
+    text = prose(f"""The two sides differ by more than {claims.SWING:g} in {one_sided} seeds of
+        plain PPO: it swings the pole all the way round, or not up at all, from one of them. With
+        symmetric copies the worst of {len(copies)} seeds differs by {copies.max():.3f}. Every claim of
+        the paper with evidence and verdict, also those that do not hold here:
         [results](docs/results.md).""")
     head = f"After {steps:.1f} million steps, {seeds} seeds per method:"
     return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"

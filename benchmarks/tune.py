@@ -86,8 +86,9 @@ def make_run(arguments: Arguments, family: str, candidate: str, seed: int) -> Ru
 def score(runs: list[Run], family: str, candidate: str) -> float:
     """Mean evaluated return over the seeds; a run without one counts as the worst."""
     found = [run.result() for run in runs if run.method == f"{family}: {candidate}"]
-    rows = [[r for r in f["evaluation"] if r["actions"] == "deterministic"] for f in found if f]
-    return float(np.mean([np.mean([r["return"] for r in each]) if each else -np.inf for each in rows]))
+    rows = [f["evaluation"] if f else [] for f in found]
+    each = [[r["return"] for r in row if r["actions"] == "deterministic"] for row in rows]
+    return float(np.mean([np.mean(values) if values else -np.inf for values in each]))
 
 
 def table(results: study.Study) -> str:

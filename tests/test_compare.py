@@ -1,7 +1,9 @@
 """benchmarks/compare.py from the outside: it draws everything, survives kills, and reports what failed."""
 
+import collections
 import csv
 import json
+import math
 import os
 import signal
 import subprocess
@@ -11,6 +13,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
+
+import compare as compare_script
+import tasks
+import tune
+from comparison import claims, methods, study
+from comparison.run import Run
+from tasks.settings import SETTINGS
 
 ROOT = Path(__file__).parents[1]
 FIGURES = {"training.png", "log_prob.png", "initialization.png", "goals.png", "efficiency.png"}
@@ -134,21 +144,83 @@ def test_other_environments_and_runs_that_diverge(tmp_path):
     assert "| PPO | 1 (1 diverged) | - |" in (tmp_path / "plots" / "custom" / "tables.md").read_text()
 
 
-def test_a_wrong_method_is_refused_before_anything_starts(tmp_path):
-    assert "expected a method made of" in compare(tmp_path, "--methods", "agu", expected=1)
-    assert "expected KEY=VALUE" in compare(tmp_path, "--config", "num_envs", expected=1)
-    assert not (tmp_path / "runs").exists()
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--methods", "agu"], "expected a method made of"),
+        (["--config", "num_envs"], "expected KEY=VALUE"),
+        (["--config", "num_env=3"], "expected KEY=VALUE"),
+        (["--config", "augmentation=none"], "expected KEY=VALUE"),
+        (["--config", "num_envs=many"], "expected num_envs like 256"),
+        (["--config", "hidden=64"], "expected hidden like"),
+        (["--workers", "0"], "expected --workers of at least 1"),
+        (["--steps", "-5"], "expected --steps of at least 1"),
+        (["--preset", "smoke", "--seeds", "3"], "expected a preset alone"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_starts(tmp_path, arguments, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        compare_script.make_runs(tyro.cli(compare_script.Arguments, args=arguments), tmp_path)
+
+
+def test_presets():
+    def runs(preset):
+        return compare_script.make_runs(compare_script.Arguments(preset=preset), Path("runs"))
+
+    ten, thirty = runs("paper-cartpole"), runs("paper-cartpole-30")
+    assert (
+        {run.folder for run in ten} < {run.folder for run in thirty} < {run.folder for run in runs("paper")}
+    )
+    assert all(run.setting.frames >= 3.3e6 and run.episodes == 500 for run in thirty)
+    seeds = collections.Counter(run.method for run in thirty)
+    assert min(seeds.values()) == 10
+    assert seeds["ppo"] == seeds["aug"] == 30
+    assert {run.task for run in runs("smoke")} == set(tasks.ALL_TASKS)
 
 
 def test_tuning_gives_every_family_the_same(tmp_path):
     script = str(ROOT / "benchmarks" / "tune.py")
-    tiny = ["--families", "ppo", "aug", "--candidates", "3", "--steps", "1", "--episodes", "1"]
+    tiny = ["--families", "ppo", "aug", "--candidates", "4", "--steps", "1", "--episodes", "1"]
     where = ["--folder", "runs", "--output", "results"]
     result = run([sys.executable, script, *tiny, *where], tmp_path)
     assert result.returncode == 0, result.stderr[-3000:]
     runs = {(row["method"], row["seed"]) for row in rows(tmp_path / "results" / "runs.csv")}
     for family in ("ppo", "aug"):
-        assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 3 * 2 + 3 * 3
+        assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 4 * 2 + 3 * 3
     lines = (tmp_path / "results" / "README.md").read_text().splitlines()
     assert "| candidate | ppo | aug |" in lines
     assert "".join(lines).count("**") == 4  # one winner per family
+
+
+def test_the_search_prefers_high_returns_and_complete_candidates(tmp_path):
+    def run(candidate, seed, value):
+        folder = tmp_path / candidate / str(seed)
+        made = Run("cartpole", f"ppo: {candidate}", seed, SETTINGS["cartpole"], folder)
+        folder.mkdir(parents=True)
+        if value is not None:
+            rows = [{"actions": "deterministic", "return": value}, {"actions": "sampled", "return": 9.0}]
+            (folder / "result.json").write_text(json.dumps(made.request() | {"evaluation": rows}))
+        return made
+
+    runs = [run("good", 0, -1.0), run("good", 1, -2.0), run("lucky", 0, -0.5), run("lucky", 1, None)]
+    assert tune.score(runs, "ppo", "good") == -1.5
+    assert tune.score(runs, "ppo", "lucky") == -math.inf
+
+
+def test_the_methods_use_what_the_search_found():
+    stored = ROOT / "benchmarks" / "results" / "tuning"
+    found = study.read(stored)
+    assert (stored / "README.md").read_text() == tune.table(found)
+    winners = {}
+    for column, family in enumerate(tune.FAMILIES, start=2):
+        rows = [line.split("|") for line in (stored / "README.md").read_text().splitlines() if "**" in line]
+        (winner,) = [row[1].strip() for row in rows if "**" in row[column]]
+        winners[methods.family(family)] = tune.CANDIDATES[winner]
+    assert methods.TUNED["cartpole"] == winners
+
+
+def test_augmentation_is_twenty_times_as_symmetric_and_no_worse():
+    found = study.read(ROOT / "benchmarks" / "results" / "paper-cartpole-30")
+    plain, copies = (claims.variations(found, method) for method in ("ppo", "aug"))
+    assert plain.mean() > 20 * copies.mean()
+    assert claims.returns(found, "aug").mean() >= claims.returns(found, "ppo").mean()

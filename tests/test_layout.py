@@ -34,9 +34,9 @@ LAYERS = (
 
 # Top-level packages that the files of a folder must not import.
 FORBIDDEN = {
-    "torchrl_sym": {"tasks", "benchmarks", "examples", "tests"},
-    "tasks": {"benchmarks", "examples", "tests"},
-    "examples": {"benchmarks", "examples", "tests"},
+    "torchrl_sym": {"tasks", "benchmarks", "comparison", "examples", "tests"},
+    "tasks": {"benchmarks", "comparison", "examples", "tests"},
+    "examples": {"benchmarks", "comparison", "examples", "tests"},
 }
 
 # Absolute paths of somebody's machine; the lookbehind leaves URLs and relative paths alone.

@@ -30,6 +30,9 @@ LABELS = {
 }
 """How figures and tables call the parts."""
 
+METHOD_FIELDS = {"augmentation", "mirror_coeff", "weight_scale", "seed"}
+"""Fields of the configuration that a method or a run decides."""
+
 # What `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as
 # many runs each (results/tuning); the rest is `tasks.settings`.
 TUNED: dict[str, dict[str, dict[str, Any]]] = {
@@ -46,26 +49,32 @@ def parts(method: str) -> tuple[str, float, float]:
     """A method's augmentation, mirror weight and initial scale.
 
     Raises:
-        ValueError: a part that is none of the module's.
+        ValueError: a part that is none of the module's, or two of a kind.
     """
-    augmentation, weight, scale = "ppo", 0.0, 1.0
+    found: dict[str, Any] = {}
     for part in method.split("+"):
         kind, _, number = part.rpartition("-")
-        try:
-            if part in AUGMENTATION:
-                augmentation = part
-            elif kind == "loss":
-                weight = float(number)
-            elif kind == "init":
-                scale = float(number)
-            else:
-                raise ValueError
-        except ValueError:
+        if part in AUGMENTATION:
+            kind, value = "augmentation", part
+        else:
+            value = _positive(number) if kind in ("loss", "init") else None
+        if value is None:
             raise ValueError(
-                f"expected a method made of {list(AUGMENTATION)}, loss-W and init-S, joined by +, got "
-                f"{part!r} in {method!r}"
-            ) from None
-    return augmentation, weight, scale
+                f"expected a method made of {list(AUGMENTATION)}, loss-W and init-S with positive numbers, "
+                f"joined by +, got {part!r} in {method!r}"
+            )
+        if kind in found:
+            raise ValueError(f"expected at most one {kind} in a method, got two in {method!r}")
+        found[kind] = value
+    return found.get("augmentation", "ppo"), found.get("loss", 0.0), found.get("init", 1.0)
+
+
+def _positive(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0 < value < math.inf else None
 
 
 def family(method: str) -> str:

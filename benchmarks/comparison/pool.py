@@ -78,7 +78,7 @@ def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
     if result["outcome"] != "finished":
         return f"{result['outcome']} (after {result['iterations']} iterations)"
     rows = [row for row in result["evaluation"] if row["actions"] == "deterministic"]
-    returns = ", ".join(f"{row['goal']} {row['return']:.2f}" for row in rows)
+    returns = ", ".join(f"{row['goal']} {float(row['return']):.2f}" for row in rows)
     return f"{returns} ({result['seconds']:.0f} s)"
 
 

@@ -27,10 +27,16 @@ def provenance() -> dict[str, Any]:
 
 
 def revision() -> str:
-    """The commit that made the results."""
-    command = ["git", "rev-parse", "--short", "HEAD"]
-    out = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True)
-    return out.stdout.strip() or "unknown"
+    """The commit of this code, with a plus sign if files have been changed since."""
+    out = _git("rev-parse", "--short", "HEAD")
+    changed = _git("status", "--porcelain", "--untracked-files=no", "--", "*.py", "*.xml")
+    return f"{out or 'unknown'}{'+' if changed else ''}"
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", *arguments]
+    root = Path(__file__).parents[2]
+    return subprocess.run(command, cwd=root, capture_output=True, text=True).stdout.strip()
 
 
 def _relative(argument: str) -> str:

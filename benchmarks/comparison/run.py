@@ -11,6 +11,7 @@ import fcntl
 import functools
 import importlib
 import json
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -24,12 +25,14 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import tasks
+from comparison.provenance import revision
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tasks.settings import SETTINGS, Setting
 from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train
 
 EVALUATION_SEED = 1000  # the same starts for every run
+MAX_STEPS = 10_000  # of an episode in evaluation
 ACTIONS = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
 
 
@@ -59,25 +62,28 @@ class Run:
         return f"{self.task} {self.method} {self.seed}"
 
     def request(self) -> dict[str, Any]:
-        """What was asked for, as JSON."""
-        stages = [{"config": dataclasses.asdict(s.config), "task": s.task} for s in self.setting.stages]
-        asked = {"task": self.task, "method": self.method, "seed": self.seed, "episodes": self.episodes}
-        return json.loads(json.dumps(asked | {"stages": stages}))
+        """What was asked for, as JSON; numbers that are not finite as text, which JSON lacks."""
+        stages = [
+            {"config": _plain(dataclasses.asdict(stage.config)), "task": _plain(stage.task)}
+            for stage in self.setting.stages
+        ]
+        asked = {"task": self.task, "method": self.method, "seed": self.seed, "stages": stages}
+        return asked | {"episodes": self.episodes, "evaluations": _plain(self.setting.evaluations)}
 
     def result(self) -> dict[str, Any] | None:
         """The result, if this very run has been finished."""
-        path = self.folder / "result.json"
-        result = json.loads(path.read_text()) if path.exists() else {}
+        result = _read(self.folder / "result.json")
         return result if all(result.get(key) == value for key, value in self.request().items()) else None
 
     def progress(self) -> tuple[int, float]:
         """Iterations done so far, and the latest mean return (NaN at first)."""
         done, latest = 0, float("nan")
         for number in range(len(self.setting.stages)):
-            table = self.folder / f"stage_{number}" / "metrics.csv"
-            lines = (
-                table.read_text().split("\n")[:-1] if table.exists() else []
-            )  # the last may be half written
+            try:
+                text = (self.folder / f"stage_{number}" / "metrics.csv").read_text()
+            except FileNotFoundError:
+                continue
+            lines = text.split("\n")[:-1]  # the last may be half written
             if len(lines) > 1:
                 done += len(lines) - 1
                 latest = float(next(csv.DictReader([lines[0], lines[-1]]))["return"])
@@ -100,12 +106,29 @@ class Run:
         return whole
 
     def execute(self) -> None:
-        """Train and evaluate, from wherever the folder is; other processes on the same folder wait."""
+        """Train and evaluate, from wherever the folder is; other processes on the same folder wait.
+
+        Raises:
+            ValueError: the folder holds a run that was asked for differently.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if self.result() is None:
+                self._claim_folder()
                 self._execute()
+
+    def _claim_folder(self) -> None:
+        """What is continued must have begun as the same run: its past decides its future."""
+        asked = {key: self.request()[key] for key in ("task", "method", "seed", "stages")}
+        path = self.folder / "request.json"
+        begun = _read(path)
+        if begun and begun != asked:
+            raise ValueError(
+                f"expected {self.folder} to be new or to hold {self} as it is asked for now, got a run "
+                "with other settings (request.json); use another --name, or delete the folder"
+            )
+        _write(path, asked)
 
     def _execute(self) -> None:
         torch.set_num_threads(self.threads)
@@ -122,22 +145,20 @@ class Run:
             try:
                 for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
                     pass
-            except (
-                FloatingPointError
-            ) as error:  # a result like any other: the same seed would end here again
+            # A result like any other: the same seed would end here again.
+            except FloatingPointError as error:
                 outcome = f"diverged: {error}"
                 break
         curve = self.curve()
-        result = self.request() | {
+        ended = {
             "outcome": outcome,
+            "revision": revision(),
             "iterations": len(curve),
             "frames": curve[-1]["frames"] if curve else 0,
             "seconds": curve[-1]["seconds"] if curve else 0.0,
             "evaluation": self._evaluate(make_env, folders[-1]),
         }
-        partial = self.folder / "result.partial"
-        partial.write_text(json.dumps(result, indent=1) + "\n")
-        os.replace(partial, self.folder / "result.json")
+        _write(self.folder / "result.json", self.request() | ended)
 
     def _evaluate(self, make_env: Callable[..., EnvBase], checkpoint: Path) -> list[dict[str, Any]]:
         """One row per evaluated task, kind of actions and goal; none if there is no checkpoint."""
@@ -175,16 +196,25 @@ def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
 def evaluate_plainly(
     env: EnvBase, actor: ProbabilisticTensorDictSequential, exploration: ExplorationType
 ) -> Evaluation:
-    """Return of one episode per row of an environment whose equivalent goals are not known."""
+    """Return of one episode per row of an environment whose equivalent goals are not known.
+
+    Raises:
+        ValueError: an episode does not end.
+    """
     with torch.no_grad(), set_exploration_type(exploration):
         following = env.reset()
         running = ~following["done"]
         returns = torch.zeros(running.shape, dtype=torch.float64)
-        while bool(running.any()):
+        for _ in range(MAX_STEPS):
             tensordict, following = env.step_and_maybe_reset(actor(following))
             returns += tensordict["next", "reward"].double() * running
             running &= ~tensordict["next", "done"]
-    return Evaluation(("all",), returns.reshape(1, -1))
+            if not bool(running.any()):
+                return Evaluation(("all",), returns.reshape(1, -1))
+    raise ValueError(
+        f"expected episodes of at most {MAX_STEPS} steps, got some that go on; end them, for example with "
+        "TransformedEnv(env, StepCounter(max_steps=...))"
+    )
 
 
 def environment(task: str, threads: int = 1) -> Callable[..., EnvBase]:
@@ -213,3 +243,23 @@ def task_setting(task: str) -> Setting:
         return SETTINGS[task]
     environment(task)
     return getattr(importlib.import_module(task.partition(":")[0]), "SETTING", Setting(PPOConfig()))
+
+
+def _plain(value: Any) -> Any:
+    """A value as it comes back from JSON."""
+    if isinstance(value, dict):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(each) for each in value]
+    return value if not isinstance(value, float) or math.isfinite(value) else str(value)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
+    """Replace a file at once: a kill leaves the old one or the new one."""
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
+    os.replace(partial, path)

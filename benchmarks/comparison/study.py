@@ -45,7 +45,7 @@ def write(
         points: rows per curve that are kept, at most; the last one always is.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    evaluated, curves, methods = [], [], {}
+    evaluated, curves, methods, revisions, episodes = [], [], {}, set(), set()
     for run in runs:
         result = run.result()
         if result is None:
@@ -54,15 +54,21 @@ def write(
         ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
         ended["outcome"] = ended["outcome"].split(":")[0]
         rows = result["evaluation"] or [{}]
+        episodes.add(result["episodes"])
         evaluated += [name | ended | row for row in rows]
         curve = run.curve()
-        every = max(1, math.ceil(len(curve) / points))
-        curves += [name | row for row in curve[::-every][::-1]]  # the last row is kept
+        every = math.ceil(
+            run.iterations / points
+        )  # not of what there is: all seeds keep the same iterations
+        kept = [row for number, row in enumerate(curve, 1) if number % every == 0 or number == len(curve)]
+        curves += [name | row for row in kept]
+        revisions.add(result["revision"])
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
-    about = provenance() | about | {"failed": [str(run) for run in failed], "methods": methods}
-    _replace(folder / "study.json", json.dumps(about, indent=1) + "\n")
+    about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
+    about |= {"failed": [str(run) for run in failed], "methods": methods}
+    _replace(folder / "study.json", json.dumps(about, indent=1, allow_nan=False) + "\n")
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -122,18 +128,19 @@ class Study:
     def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
         """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
 
-        A run that diverged keeps its last value, so that it is not dropped from the average; one that
-        diverged at once has no curve.
+        At every point, a seed's value is its latest. So one that diverged keeps its last, and is not
+        dropped from the average; one that diverged before it had a value is.
         """
         columns = [c for (t, m, _), c in self.curves.items() if (t, m) == (task, method)]
         if not columns:
             return np.zeros(0), np.zeros((0, 0))
-        longest = max(columns, key=lambda c: len(c["frames"]))["frames"]
-        values = np.full((len(columns), len(longest)), np.nan)
-        for row, c in zip(values, columns, strict=True):
-            row[: len(c[column])] = c[column]
-            row[len(c[column]) :] = c[column][-1]
-        return longest / 1e6, values
+        steps = max(columns, key=lambda c: c["frames"][-1])["frames"]
+        values = []
+        for c in columns:
+            latest = np.searchsorted(c["frames"], steps, side="right") - 1
+            values.append(np.where(latest < 0, np.nan, c[column][latest]))
+        values = np.array(values)
+        return steps / 1e6, values[np.isfinite(values[:, -1])]
 
     def goal_returns(
         self, task: str, method: str, column: str = "return", actions: str = "deterministic"
@@ -149,10 +156,10 @@ class Study:
         values = [[math.nan if found[s, g] is None else found[s, g] for g in goals] for s in seeds]
         return goals, np.array(values).reshape(len(seeds), len(goals))
 
-    def diverged(self, task: str, method: str) -> int:
-        """Runs of a method that ended in numbers that are not finite."""
+    def diverged(self, task: str, method: str) -> set[int]:
+        """Seeds of a method that ended in numbers that are not finite."""
         rows = [r for r in self.runs if (r["task"], r["method"]) == (task, method)]
-        return len({r["seed"] for r in rows if r["outcome"] == "diverged"})
+        return {r["seed"] for r in rows if r["outcome"] == "diverged"}
 
 
 def read(folder: Path) -> Study:

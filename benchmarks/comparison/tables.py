@@ -12,7 +12,7 @@ SHARE = 0.9  # of the way from the first return to the best method's last: the t
 
 def tables(study: Study) -> str:
     """All tables of a study."""
-    text = f"Made by `{study.about['command']}` at {study.about['revision']}, "
+    text = f"Made by `{study.about['command']}` at {', '.join(study.about['revisions'])}, "
     text += f"{study.about['machine']}, {study.about['workers']} runs at a time.\n"
     for task in study.tasks:
         text += f"\n## {task}\n\n{table_1(study, task)}\n{efficiency_table(study, task)}"
@@ -30,15 +30,18 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
     for method in shown:
         returns = study.goal_returns(task, method)[1]
         seeds = len(study.seeds(task, method))
-        gone = study.diverged(task, method)
-        row = [label(method), f"{seeds} ({gone} diverged)" if gone else str(seeds)]
-        if not len(returns):
+        gone = len(study.diverged(task, method))
+        missing = seeds - len(returns)  # they diverged before their first checkpoint
+        row = [label(method), f"{seeds} ({gone} diverged, {missing} at once)" if gone else str(seeds)]
+        if missing == seeds:
             rows.append([*row, *["-"] * (len(rows[0]) - 2)])
             continue
         variations = variation(returns)
+        comparable = returns.shape[1] > 1
         loss = np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12)
-        row += [estimate(returns.mean(axis=1)).format(), estimate(variations).format()]
-        row += [f"{variations.max():.3f}", f"{np.exp(iqm(np.log(loss))):.2g}"]
+        row += [estimate(returns.mean(axis=1)).format()]
+        row += [estimate(variations).format(), f"{variations.max():.3f}"] if comparable else ["-", "-"]
+        row += [f"{np.exp(iqm(np.log(loss))):.2g}"]
         if has_success:
             row += [f"{successes[method].mean():.1%}", f"{successes[method].mean(axis=0).min():.1%}"]
         rows.append(row)
@@ -94,11 +97,26 @@ def threshold(study: Study, task: str) -> float:
 def steps_to(study: Study, task: str, method: str, goal: float) -> np.ndarray:
     """Million steps at which each seed's smoothed training return first reaches a value; inf if never."""
     steps, values = study.curve(task, method, "return")
-    if not np.isfinite(goal) or len(steps) < SMOOTHING:
-        return np.full(len(values), np.inf)
-    smooth = np.lib.stride_tricks.sliding_window_view(values, SMOOTHING, axis=1).mean(axis=-1)
-    there = smooth >= goal
-    return np.where(there.any(axis=1), steps[SMOOTHING - 1 :][there.argmax(axis=1)], np.inf)
+    never = np.full(len(study.seeds(task, method)), np.inf)
+    if len(steps) < SMOOTHING:
+        return never
+    there = smooth(values) >= goal
+    reached = np.where(there.any(axis=1), steps[SMOOTHING - 1 :][there.argmax(axis=1)], np.inf)
+    return np.concatenate([reached, never[len(reached) :]])
+
+
+def steps_to_own(study: Study, task: str, method: str) -> np.ndarray:
+    """Million steps to `SHARE` of the way to each seed's own last return: speed alone, wherever it ends."""
+    steps, values = study.curve(task, method, "return")
+    levels = smooth(values)
+    first = np.array([row[np.isfinite(row)][0] for row in levels])
+    there = levels >= ((1 - SHARE) * first + SHARE * levels[:, -1])[:, None]
+    return steps[SMOOTHING - 1 :][there.argmax(axis=1)]
+
+
+def smooth(values: np.ndarray) -> np.ndarray:
+    """Mean of the last few logged iterations; as many points fewer, less one."""
+    return np.lib.stride_tricks.sliding_window_view(values, SMOOTHING, axis=1).mean(axis=-1)
 
 
 def seconds_per_step(study: Study, task: str, method: str) -> float:
