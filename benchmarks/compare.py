@@ -65,7 +65,7 @@ _CARTPOLE = (
 )
 _DECISIVE = (
     *_CARTPOLE,
-    Experiment(("cartpole",), ("aug-naive-raw",), 10),
+    Experiment(("cartpole",), ("aug-naive-raw", "aug+loss-0.1+init-0.1"), 10),
     Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 30),
 )
 

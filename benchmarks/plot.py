@@ -32,6 +32,7 @@ COLORS = {
     "aug-naive-raw": "tab:brown",
 }
 SHADES = {"ppo": "Greens", "aug": "Purples"}  # with a mirror loss, darker for larger weights
+STEPS = "million environment steps"
 SCALES = "viridis"  # initial weights, from small to large
 
 
@@ -67,6 +68,15 @@ def grid(rows: int, columns: int, width: float = 4.0, height: float = 2.9):
     return figure, axes
 
 
+def pairs(columns: int, width: float = 5.2):
+    """Two panels per column, one above the other; side by side if there is but one column."""
+    if columns == 1:
+        figure, axes = grid(1, 2, width, 3.4)
+        return figure, [tuple(axes[0])]
+    figure, axes = grid(2, columns, width)
+    return figure, [tuple(column) for column in axes.T]
+
+
 def color(method: str):
     """A method's colour: hue for the augmentation, shade for the weight of the mirror loss."""
     augmentation, weight, _ = parts(method)
@@ -93,14 +103,14 @@ def draw_curve(axis: Axes, study: Study, task: str, method: str, column: str, **
 
 def training(study: Study):
     """Return and symmetry loss over environment steps, a column per task."""
-    figure, axes = grid(2, len(study.tasks), 5.2)
-    for (top, bottom), task in zip(axes.T, study.tasks, strict=True):
+    figure, panels = pairs(len(study.tasks))
+    for (top, bottom), task in zip(panels, study.tasks, strict=True):
         bottom.set_yscale("log")
         for method in without(study.methods(task), naive=True, scales=True):
             draw_curve(top, study, task, method, "return")
             draw_curve(bottom, study, task, method, "mirror_loss")
-        top.set(title=task, ylabel="training return")
-        bottom.set(xlabel="million environment steps", ylabel="symmetry loss")
+        top.set(title=task, xlabel=STEPS, ylabel="training return")
+        bottom.set(xlabel=STEPS, ylabel="symmetry loss")
         legend(top)
     return figure
 
@@ -111,8 +121,8 @@ def log_prob(study: Study):
     shown = [task for task in study.tasks if {"aug", "aug-naive"} <= set(study.methods(task))]
     if not shown:
         return None
-    figure, axes = grid(2, len(shown), 5.2)
-    for (top, bottom), task in zip(axes.T, shown, strict=True):
+    figure, panels = pairs(len(shown))
+    for (top, bottom), task in zip(panels, shown, strict=True):
         for method, column in rules.items():
             if method not in study.methods(task):
                 continue
@@ -124,9 +134,11 @@ def log_prob(study: Study):
                         top.plot(own["frames"][-1] / 1e6, own[column][-1], "x", **style)
             top.plot([], [], color=color(method), label=label(method))
             draw_curve(bottom, study, task, method, "return")
-        top.set_yscale("symlog", linthresh=10)
-        top.set(title=f"{task}: log probability in the denominator", ylabel="mean over augmented samples")
-        bottom.set(xlabel="million environment steps", ylabel="training return")
+        if top.get_ylim()[0] < -100:
+            top.set_yscale("symlog", linthresh=10)
+        what = f"{task}: log-probability in the denominator"
+        top.set(title=what, xlabel=STEPS, ylabel="mean over augmented samples")
+        bottom.set(xlabel=STEPS, ylabel="training return")
         legend(top)
     return figure
 
@@ -153,7 +165,7 @@ def initialization(study: Study):
             draw_curve(top, study, task, method, "return", **style)
             draw_curve(bottom, study, task, method, "mirror_loss", **style)
         top.set(title=f"{task}: {label(base)}", ylabel="training return")
-        bottom.set(xlabel="million environment steps", ylabel="symmetry loss")
+        bottom.set(xlabel=STEPS, ylabel="symmetry loss")
         legend(top)
     for row in axes:
         share_limits(row)
@@ -192,8 +204,8 @@ def goals(study: Study):
 
 def efficiency(study: Study):
     """Share of seeds whose training return has reached a threshold, over steps and over seconds."""
-    figure, axes = grid(2, len(study.tasks), 5.2)
-    for (top, bottom), task in zip(axes.T, study.tasks, strict=True):
+    figure, panels = pairs(len(study.tasks))
+    for (top, bottom), task in zip(panels, study.tasks, strict=True):
         goal = threshold(study, task)
         for method in without(study.methods(task), naive=True, scales=True):
             reached = np.sort(steps_to(study, task, method, goal))
@@ -209,7 +221,7 @@ def efficiency(study: Study):
             bottom.step(x * 1e6 * seconds_per_step(study, task, method), y, **style)
         top.set(
             title=f"{task}: training return ≥ {goal:.2f}",
-            xlabel="million environment steps",
+            xlabel=STEPS,
             ylabel="share of seeds",
         )
         bottom.set(xlabel="seconds on one core", ylabel="share of seeds")

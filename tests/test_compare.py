@@ -115,6 +115,8 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     compare(killed, *what)
     for name in ("runs.csv", "curves.csv"):
         assert rows(whole / "results/custom" / name) == rows(killed / "results/custom" / name)
+    about = [(folder / "results/custom/study.json").read_text() for folder in (whole, killed)]
+    assert about[0] == about[1]
     before = (killed / "results/custom/curves.csv").read_text()
     compare(killed, *what)  # nothing is left to do
     assert (killed / "results/custom/curves.csv").read_text() == before
