@@ -65,8 +65,8 @@ _CARTPOLE = (
 )
 _DECISIVE = (
     *_CARTPOLE,
-    Experiment(("cartpole",), ("aug-naive-raw", "aug+loss-0.1+init-0.1"), 10),
     Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 30),
+    Experiment(("cartpole",), ("aug+loss-0.1+init-0.1", "aug-naive-raw"), 10),
 )
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
