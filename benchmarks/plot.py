@@ -1,6 +1,6 @@
 """Draws every figure and table of a comparison from its stored results alone.
 
-    python benchmarks/plot.py paper-cartpole-30
+    python benchmarks/plot.py paper-cartpole-20
 
 Figures: `training` (the paper's learning curves of return and symmetry loss), `log_prob` (its log action
 probabilities of augmented samples, original rule against naive), `initialization` (its study of initial
@@ -244,7 +244,7 @@ def legend(axis: Axes) -> None:
 class Arguments:
     """Draw figures and tables from stored results."""
 
-    name: tyro.conf.Positional[str] = "paper-cartpole-30"
+    name: tyro.conf.Positional[str] = "paper-cartpole-20"
     """What the results are called."""
     results: Path = HERE / "results"
     """Where results are, in a folder of their name."""

@@ -17,7 +17,7 @@ from comparison.study import Study, read
 from comparison.tables import efficiency_table, table_1
 
 HERE = Path(__file__).parent
-STUDY = "paper-cartpole-30"
+STUDY = "paper-cartpole-20"
 README_METHODS = ["ppo", "loss-1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {
     "training": "Training return and symmetry loss over environment steps (the paper's training figure).",

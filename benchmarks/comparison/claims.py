@@ -184,9 +184,7 @@ def _naive(study: Study) -> Judgement:
     good, bad = reached(study, "aug"), reached(study, "aug-naive")
     raw = f"{len(study.diverged(TASK, 'aug-naive-raw'))} of {len(study.seeds(TASK, 'aug-naive-raw'))}"
     text = f"lowest mean log-probability of a run (median of seeds) {low:.0f}, original rule {kept:.1f}; "
-    text += (
-        f"threshold reached by {bad[0]} of {bad[1]}, original rule {good[0]} of {good[1]}; without bounds "
-    )
+    text += f"threshold reached by {bad[0]} of {bad[1]}, original rule {good[0]} of {good[1]}; unprotected "
     return f"{text}{raw} runs end in numbers that are not finite", more(good, bad)
 
 

@@ -17,8 +17,15 @@ AUGMENTATION: dict[str, dict[str, Any]] = {
     "aug": {"augmentation": "all"},
     "aug-random": {"augmentation": "random"},
     "aug-naive": {"augmentation": "naive"},
-    # Without the bounds of log-ratio and deviation that keep the naive rule finite.
-    "aug-naive-raw": {"augmentation": "naive", "max_log_ratio": math.inf, "max_std": math.inf},
+    # Without what keeps the naive rule finite: bounds of log-ratio and deviation, and a learning rate that
+    # falls when the ratios of the copies explode. Instead the rate that augmentation learns with, its cap.
+    "aug-naive-raw": {
+        "augmentation": "naive",
+        "max_log_ratio": math.inf,
+        "max_std": math.inf,
+        "desired_kl": None,
+        "learning_rate": 1e-2,
+    },
 }
 
 LABELS = {
@@ -26,7 +33,7 @@ LABELS = {
     "aug": "PPO + aug.",
     "aug-random": "PPO + aug. (random)",
     "aug-naive": "naive aug.",
-    "aug-naive-raw": "naive aug., unbounded",
+    "aug-naive-raw": "naive aug., unprotected",
 }
 """How figures and tables call the parts."""
 
