@@ -136,6 +136,7 @@ def log_prob(study: Study):
             draw_curve(bottom, study, task, method, "return")
         if top.get_ylim()[0] < -100:
             top.set_yscale("symlog", linthresh=10)
+            top.set_ylim(top=5.0)
         what = f"{task}: log-probability in the denominator"
         top.set(title=what, xlabel=STEPS, ylabel="mean over augmented samples")
         bottom.set(xlabel=STEPS, ylabel="training return")
