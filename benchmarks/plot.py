@@ -92,7 +92,7 @@ def draw_curve(axis: Axes, study: Study, task: str, method: str, column: str, **
     if logarithmic:
         values = np.log(np.maximum(values, 1e-12))
     known = np.isfinite(values).all(axis=0)
-    if not known.any():
+    if not len(values) or not known.any():
         return
     steps, values = steps[known], values[:, known]
     lines = [iqm(values), *band(values)]
@@ -210,11 +210,12 @@ def efficiency(study: Study):
         goal = threshold(study, task)
         for method in without(study.methods(task), naive=True, scales=True):
             reached = np.sort(steps_to(study, task, method, goal))
-            if not len(reached):
+            steps = study.curve(task, method, "return")[0]
+            if not len(steps):
                 continue
             share = np.arange(1, len(reached) + 1) / len(reached)
             known = np.isfinite(reached)
-            end = study.curve(task, method, "return")[0][-1]
+            end = steps[-1]
             x = np.concatenate([[0.0], reached[known], [end]])
             y = np.concatenate([[0.0], share[known], share[known][-1:] if known.any() else [0.0]])
             style = {"color": color(method), "label": label(method), "where": "post", "linewidth": 1.4}

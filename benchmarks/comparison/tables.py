@@ -86,7 +86,7 @@ def threshold(study: Study, task: str) -> float:
     for method in study.methods(task):
         values = study.curve(task, method, "return")[1]
         known = np.isfinite(values).all(axis=0)
-        if known.any():
+        if len(values) and known.any():
             first.append(iqm(values[:, known][:, 0]))
             last.append(iqm(values[:, known][:, -1]))
     if not first:
