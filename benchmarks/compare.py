@@ -68,7 +68,8 @@ _MORE_SEEDS = (
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
-        Experiment(("cartpole",), ALL, 2, 32 * 50 * 12, _TINY, 4),
+        Experiment(("cartpole",), ALL, 1, 32 * 50 * 12, _TINY, 4),
+        Experiment(("cartpole",), ("ppo", "aug"), 2, 32 * 50 * 12, _TINY, 4),
         Experiment(("anymal_push", "anymal_climb", "trifinger_repose"), ("ppo", "aug"), 1, 3200, _TINY, 4),
     ),
     "paper-cartpole": (_CARTPOLE,),
