@@ -11,7 +11,6 @@ ones, on as many episodes for every equivalent goal.
 
 import csv
 import dataclasses
-import functools
 import json
 import math
 import platform
@@ -26,9 +25,10 @@ from torchrl.envs.utils import ExplorationType
 
 import tasks
 from comparison.provenance import provenance
+from comparison.run import environment, read_curve, stage_folders, train_stages
 from tasks.evaluation import evaluate
 from tasks.settings import SETTINGS, Setting
-from torchrl_sym.recipes import export_actor, load_actor, read_metrics, train
+from torchrl_sym.recipes import export_actor, load_actor, read_metrics
 
 RESULTS = Path(__file__).parent / "results" / "learn"
 
@@ -62,15 +62,9 @@ def main(arguments: Arguments) -> None:
     output = arguments.output / arguments.task
     if not arguments.plot:
         setting = chosen(arguments)
-        folders: list[Path] = []
-        for stage in setting.stages:
-            folder = arguments.folder / arguments.task / f"stage_{len(folders)}"
-            make_env = functools.partial(tasks.make_env, arguments.task, num_threads=1, **stage.task)
-            where = {"folder": folder, "start_from": folders[-1] if folders else None}
-            for _ in train(stage.config, make_env, make_env(num_envs=1).symmetry, progress=True, **where):
-                pass
-            folders.append(folder)
-        report(arguments, setting, folders, output)
+        folder = arguments.folder / arguments.task
+        train_stages(setting, environment(arguments.task), folder, progress=True)
+        report(arguments, setting, folder, output)
     draw(output)
     (arguments.output / "README.md").write_text(table(arguments.output))
     print(f"written to {output}")
@@ -83,10 +77,12 @@ def chosen(arguments: Arguments) -> Setting:
     return SETTINGS[arguments.task].replace(**changes)
 
 
-def report(arguments: Arguments, setting: Setting, folders: list[Path], output: Path) -> None:
+def report(arguments: Arguments, setting: Setting, folder: Path, output: Path) -> None:
     """Evaluate the last policy, and write everything that the pictures need."""
-    export_actor(folders[-1], output)
-    last = join([read_metrics(folder / "metrics.csv") for folder in folders], output / "metrics.csv")
+    export_actor(stage_folders(folder)[-1], output)
+    curve = read_curve(folder)
+    last = curve[-1]
+    write_curve(curve, output / "metrics.csv")
     result = provenance() | {
         "stages": [{"config": dataclasses.asdict(s.config), "task": s.task} for s in setting.stages],
         "frames": last["frames"],
@@ -100,13 +96,8 @@ def report(arguments: Arguments, setting: Setting, folders: list[Path], output: 
     (output / "result.json").write_text(json.dumps(result, indent=2) + "\n")
 
 
-def join(stages: list[list[dict[str, float]]], path: Path) -> dict[str, float]:
-    """Write the tables of all stages as one of some 500 rows; returns the frames and seconds in all."""
-    total = {"frames": 0.0, "seconds": 0.0}
-    whole = []
-    for number, rows in enumerate(stages):
-        whole += [{"stage": number, **row, **{key: row[key] + total[key] for key in total}} for row in rows]
-        total = {key: whole[-1][key] for key in total}
+def write_curve(whole: list[dict[str, float]], path: Path) -> None:
+    """Write the metrics of all stages as one table of some 500 rows."""
     every = math.ceil(len(whole) / 500)
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, fieldnames=list(whole[0]))
@@ -114,7 +105,6 @@ def join(stages: list[list[dict[str, float]]], path: Path) -> dict[str, float]:
         for row in whole[::-every][::-1]:  # the last row is kept
             exact = ("stage", "iteration", "frames")
             writer.writerow({k: int(v) if k in exact else f"{v:.5g}" for k, v in row.items()})
-    return total
 
 
 def table(folder: Path) -> str:

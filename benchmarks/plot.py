@@ -106,7 +106,7 @@ def training(study: Study):
     figure, panels = pairs(len(study.tasks))
     for (top, bottom), task in zip(panels, study.tasks, strict=True):
         bottom.set_yscale("log")
-        for method in without(study.methods(task), naive=True, scales=True):
+        for method in compared(study.methods(task)):
             draw_curve(top, study, task, method, "return")
             draw_curve(bottom, study, task, method, "mirror_loss")
         top.set(title=task, xlabel=STEPS, ylabel="training return")
@@ -126,12 +126,12 @@ def log_prob(study: Study):
         for method, column in rules.items():
             if method not in study.methods(task):
                 continue
-            for (t, m, seed), own in study.curves.items():
-                if (t, m) == (task, method):
-                    style = {"color": color(method), "linewidth": 0.8, "alpha": 0.8}
-                    top.plot(own["frames"] / 1e6, own[column], **style)
-                    if seed in study.diverged(task, method):
-                        top.plot(own["frames"][-1] / 1e6, own[column][-1], "x", **style)
+            style = {"color": color(method), "linewidth": 0.8, "alpha": 0.8}
+            diverged = study.diverged(task, method)
+            for seed, own in study.curves_of(task, method).items():
+                top.plot(own["frames"] / 1e6, own[column], **style)
+                if seed in diverged:
+                    top.plot(own["frames"][-1] / 1e6, own[column][-1], "x", **style)
             top.plot([], [], color=color(method), label=label(method))
             draw_curve(bottom, study, task, method, "return")
         if top.get_ylim()[0] < -100:
@@ -208,7 +208,7 @@ def efficiency(study: Study):
     figure, panels = pairs(len(study.tasks))
     for (top, bottom), task in zip(panels, study.tasks, strict=True):
         goal = threshold(study, task)
-        for method in without(study.methods(task), naive=True, scales=True):
+        for method in compared(study.methods(task)):
             reached = np.sort(steps_to(study, task, method, goal))
             steps = study.curve(task, method, "return")[0]
             if not len(steps):
@@ -231,10 +231,9 @@ def efficiency(study: Study):
     return figure
 
 
-def without(methods: Iterable[str], *, naive: bool, scales: bool) -> list[str]:
-    """Methods without the naive ones, and without other initial weights."""
-    kept = [m for m in methods if not (naive and parts(m)[0].startswith("aug-naive"))]
-    return [m for m in kept if not (scales and parts(m)[2] != 1.0)]
+def compared(methods: Iterable[str]) -> list[str]:
+    """Methods that learn from ordinary initial weights: those of the paper's training figure."""
+    return [m for m in methods if parts(m)[2] == 1.0 and not parts(m)[0].startswith("aug-naive")]
 
 
 def legend(axis: Axes) -> None:

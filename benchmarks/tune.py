@@ -20,6 +20,7 @@ from comparison import study
 from comparison.methods import configure
 from comparison.pool import execute_all
 from comparison.run import Run, task_setting
+from comparison.tables import markdown
 
 HERE = Path(__file__).parent
 FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
@@ -116,7 +117,7 @@ def table(results: study.Study) -> str:
         f"{task} and, in brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the "
     )
     text += f"best {KEPT} of a family got {len(MORE)} more. Bold: the winner among those.\n\n"
-    return text + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    return text + markdown(lines)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType
 from comparison import claims, methods, tables
 from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
-from comparison.run import Run, environment, task_setting
+from comparison.run import Run, environment, read_curve, task_setting
 from comparison.study import Study, read, write
 from tasks.settings import SETTINGS
 from torchrl_sym.recipes import train
@@ -235,7 +235,7 @@ def test_results_survive_writing_and_reading(tmp_path):
     np.testing.assert_allclose(values[0], stored, rtol=1e-5)
     steps, losses = study.curve("cartpole", "ppo", "mirror_loss")
     assert steps.tolist() == [32e-6, 64e-6]
-    np.testing.assert_allclose(losses[0], [row["mirror_loss"] for row in run.curve()], rtol=1e-5)
+    np.testing.assert_allclose(losses[0], [row["mirror_loss"] for row in read_curve(run.folder)], rtol=1e-5)
     # Asked for something else, it counts as not done, and its folder is refused.
     assert dataclasses.replace(run, episodes=3).result() is None
     longer = dataclasses.replace(run, setting=setting.replace(iterations=3))
@@ -249,7 +249,7 @@ def test_stages_follow_each_other_also_after_an_interruption(tmp_path):
     setting = dataclasses.replace(tiny, then=(tiny.replace(iterations=3, gamma=0.9),))
     whole = Run("cartpole", "ppo", 0, setting, tmp_path / "whole", episodes=2)
     whole.execute()
-    curve = whole.curve()
+    curve = read_curve(whole.folder)
     assert [row["stage"] for row in curve] == [0, 0, 1, 1, 1]
     assert [row["frames"] for row in curve] == [32, 64, 96, 128, 160]
     assert whole.progress()[0] == whole.iterations == 5
@@ -271,7 +271,7 @@ def test_stages_follow_each_other_also_after_an_interruption(tmp_path):
     second.close()
     killed.execute()
     keys = ("frames", "mirror_loss", "log_prob", "kl")
-    assert [[row[key] for key in keys] for row in killed.curve()] == [
+    assert [[row[key] for key in keys] for row in read_curve(killed.folder)] == [
         [row[key] for key in keys] for row in curve
     ]
     assert killed.result()["evaluation"] == whole.result()["evaluation"]

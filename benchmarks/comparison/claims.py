@@ -16,7 +16,7 @@ from scipy import stats
 from comparison.intervals import Estimate, difference, iqm
 from comparison.methods import label
 from comparison.study import Study
-from comparison.tables import seconds_per_step, steps_to, steps_to_own, threshold, variation
+from comparison.tables import markdown, seconds_per_step, steps_to, steps_to_own, threshold, variation
 
 TASK = "cartpole"
 # A goal that is solved by swinging the long way round costs about 2; half of it tells the two ways apart.
@@ -262,8 +262,8 @@ def _random(study: Study) -> Judgement:
 
 def table(study: Study) -> str:
     """All claims with evidence and verdict, as Markdown."""
-    lines = ["| claim | place | evidence here | verdict |", "| --- | --- | --- | --- |"]
+    rows = [["claim", "place", "evidence here", "verdict"], ["---"] * 4]
     for each in CLAIMS:
         evidence, outcome = each.judge(study)
-        lines.append(f"| {each.text} | {each.place} | {evidence} | **{outcome}** |")
-    return "\n".join(lines) + "\n"
+        rows.append([each.text, each.place, evidence, f"**{outcome}**"])
+    return markdown(rows)

@@ -78,9 +78,9 @@ class Run:
     def progress(self) -> tuple[int, float]:
         """Iterations done so far, and the latest mean return (NaN at first)."""
         done, latest = 0, float("nan")
-        for number in range(len(self.setting.stages)):
+        for folder in stage_folders(self.folder):
             try:
-                text = (self.folder / f"stage_{number}" / "metrics.csv").read_text()
+                text = (folder / "metrics.csv").read_text()
             except FileNotFoundError:
                 continue
             lines = text.split("\n")[:-1]  # the last may be half written
@@ -93,17 +93,6 @@ class Run:
     def iterations(self) -> int:
         """Iterations in all."""
         return sum(stage.config.iterations for stage in self.setting.stages)
-
-    def curve(self) -> list[dict[str, float]]:
-        """Metrics of all stages, with frames and seconds counted through."""
-        whole: list[dict[str, float]] = []
-        for number in range(len(self.setting.stages)):
-            table = self.folder / f"stage_{number}" / "metrics.csv"
-            before = whole[-1] if whole else {"frames": 0, "seconds": 0.0}
-            for row in read_metrics(table) if table.exists() else []:
-                through = {key: row[key] + before[key] for key in ("frames", "seconds")}
-                whole.append({"stage": number, **row, **through})
-        return whole
 
     def execute(self) -> None:
         """Train and evaluate, from wherever the folder is; other processes on the same folder wait.
@@ -128,37 +117,26 @@ class Run:
                 f"expected {self.folder} to be new or to hold {self} as it is asked for now, got a run "
                 "with other settings (request.json); use another --name, or delete the folder"
             )
-        _write(path, asked)
+        write_json(path, asked)
 
     def _execute(self) -> None:
         torch.set_num_threads(self.threads)
         make_env = environment(self.task, self.threads)
         outcome = "finished"
-        folders: list[Path] = []
-        for stage in self.setting.stages:
-            make = functools.partial(make_env, **stage.task)
-            where = {
-                "folder": self.folder / f"stage_{len(folders)}",
-                "start_from": folders[-1] if folders else None,
-            }
-            folders.append(where["folder"])
-            try:
-                for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
-                    pass
-            # A result like any other: the same seed would end here again.
-            except FloatingPointError as error:
-                outcome = f"diverged: {error}"
-                break
-        curve = self.curve()
+        try:
+            train_stages(self.setting, make_env, self.folder)
+        except FloatingPointError as error:  # a result like any other: the same seed would end here again
+            outcome = f"diverged: {error}"
+        curve = read_curve(self.folder)
         ended = {
             "outcome": outcome,
             "revision": revision(),
             "iterations": len(curve),
             "frames": curve[-1]["frames"] if curve else 0,
             "seconds": curve[-1]["seconds"] if curve else 0.0,
-            "evaluation": self._evaluate(make_env, folders[-1]),
+            "evaluation": self._evaluate(make_env, stage_folders(self.folder)[-1]),
         }
-        _write(self.folder / "result.json", self.request() | ended)
+        write_json(self.folder / "result.json", self.request() | ended)
 
     def _evaluate(self, make_env: Callable[..., EnvBase], checkpoint: Path) -> list[dict[str, Any]]:
         """One row per evaluated task, kind of actions and goal; none if there is no checkpoint."""
@@ -178,6 +156,36 @@ class Run:
                     outcome = evaluate_plainly(many, actor, exploration)
                 rows += [{"what": what, "actions": actions, **row} for row in goal_rows(outcome)]
         return rows
+
+
+def train_stages(
+    setting: Setting, make_env: Callable[..., EnvBase], folder: Path, *, progress: bool = False
+) -> None:
+    """Train all stages of a setting in `stage_0`, `stage_1`, ... of a folder, each from the one before."""
+    earlier = None
+    for number, stage in enumerate(setting.stages):
+        make = functools.partial(make_env, **stage.task)
+        where = {"folder": folder / f"stage_{number}", "start_from": earlier, "progress": progress}
+        for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
+            pass
+        earlier = where["folder"]
+
+
+def stage_folders(folder: Path) -> list[Path]:
+    """Folders of the stages that have begun, in order."""
+    return sorted(folder.glob("stage_*"), key=lambda path: int(path.name.removeprefix("stage_")))
+
+
+def read_curve(folder: Path) -> list[dict[str, float]]:
+    """Metrics of all stages, with frames and seconds counted through."""
+    whole: list[dict[str, float]] = []
+    for number, stage in enumerate(stage_folders(folder)):
+        table = stage / "metrics.csv"
+        before = whole[-1] if whole else {"frames": 0, "seconds": 0.0}
+        for row in read_metrics(table) if table.exists() else []:
+            through = {key: row[key] + before[key] for key in ("frames", "seconds")}
+            whole.append({"stage": number, **row, **through})
+    return whole
 
 
 def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
@@ -258,7 +266,7 @@ def _read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text()) if path.exists() else {}
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
+def write_json(path: Path, content: dict[str, Any]) -> None:
     """Replace a file at once: a kill leaves the old one or the new one."""
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")

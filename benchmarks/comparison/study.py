@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from comparison.provenance import provenance
-from comparison.run import Run
+from comparison.run import Run, read_curve, write_json
 
 RUN = ("task", "method", "seed")
 EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")
@@ -56,7 +56,7 @@ def write(
         rows = result["evaluation"] or [{}]
         episodes.add(result["episodes"])
         evaluated += [name | ended | row for row in rows]
-        curve = run.curve()
+        curve = read_curve(run.folder)
         every = math.ceil(
             run.iterations / points
         )  # not of what there is: all seeds keep the same iterations
@@ -68,7 +68,7 @@ def write(
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
     about |= {"failed": [str(run) for run in failed], "methods": methods}
-    _replace(folder / "study.json", json.dumps(about, indent=1, allow_nan=False) + "\n")
+    write_json(folder / "study.json", about)
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -89,12 +89,6 @@ def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, An
 
 def _short(value: Any) -> Any:
     return f"{value:.6g}" if isinstance(value, float) else value
-
-
-def _replace(path: Path, text: str) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_text(text)
-    os.replace(partial, path)
 
 
 @dataclass(frozen=True)
@@ -122,8 +116,7 @@ class Study:
 
     def seeds(self, task: str, method: str) -> list[int]:
         """Seeds of a method."""
-        found = [row["seed"] for row in self.runs if (row["task"], row["method"]) == (task, method)]
-        return list(dict.fromkeys(found))
+        return list(dict.fromkeys(row["seed"] for row in self._rows(task, method)))
 
     def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
         """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
@@ -131,7 +124,7 @@ class Study:
         At every point, a seed's value is its latest. So one that diverged keeps its last, and is not
         dropped from the average; one that diverged before it had a value is.
         """
-        columns = [c for (t, m, _), c in self.curves.items() if (t, m) == (task, method)]
+        columns = list(self.curves_of(task, method).values())
         if not columns:
             return np.zeros(0), np.zeros((0, 0))
         steps = max(columns, key=lambda c: c["frames"][-1])["frames"]
@@ -146,8 +139,7 @@ class Study:
         self, task: str, method: str, column: str = "return", actions: str = "deterministic"
     ) -> tuple[list[str], np.ndarray]:
         """Names of the goals, and their mean returns ``(seeds, goals)`` in the first evaluation."""
-        rows = [r for r in self.runs if (r["task"], r["method"]) == (task, method)]
-        rows = [r for r in rows if r.get("actions") == actions]
+        rows = [r for r in self._rows(task, method) if r.get("actions") == actions]
         first = rows[0]["what"] if rows else None
         rows = [r for r in rows if r["what"] == first]
         goals = list(dict.fromkeys(r["goal"] for r in rows))
@@ -158,8 +150,14 @@ class Study:
 
     def diverged(self, task: str, method: str) -> set[int]:
         """Seeds of a method that ended in numbers that are not finite."""
-        rows = [r for r in self.runs if (r["task"], r["method"]) == (task, method)]
-        return {r["seed"] for r in rows if r["outcome"] == "diverged"}
+        return {r["seed"] for r in self._rows(task, method) if r["outcome"] == "diverged"}
+
+    def curves_of(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
+        """Columns of a method's curves, by seed."""
+        return {seed: c for (t, m, seed), c in self.curves.items() if (t, m) == (task, method)}
+
+    def _rows(self, task: str, method: str) -> list[dict[str, Any]]:
+        return [row for row in self.runs if (row["task"], row["method"]) == (task, method)]
 
 
 def read(folder: Path) -> Study:

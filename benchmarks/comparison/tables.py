@@ -123,8 +123,8 @@ def seconds_per_step(study: Study, task: str, method: str) -> float:
     """Wall-clock seconds per environment step: the median over all logged intervals of all seeds."""
     costs = [
         np.diff(c["seconds"]) / np.diff(c["frames"])
-        for (t, m, _), c in study.curves.items()
-        if (t, m) == (task, method) and len(c["frames"]) > 1
+        for c in study.curves_of(task, method).values()
+        if len(c["frames"]) > 1
     ]
     return float(np.median(np.concatenate(costs))) if costs else float("nan")
 
