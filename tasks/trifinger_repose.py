@@ -40,7 +40,7 @@ FIRST_SHARE, LAST_LEVEL = 0.4, 7
 # An episode that ends farther from its goal, m, lowers the level.
 FAILURE_DISTANCE = 0.06
 LIFT, HIGHEST = 0.0825, 0.1  # goal of difficulty 2 and highest goal of 3 and 4, m
-# Success: position error, m, at difficulty 1 and above, and orientation error, rad, at difficulty 4.
+# Success: position error, m, at difficulty 1 and above; orientation error, rad, where the goal has one.
 PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
 # The cube has left the arena, m: beyond the upper edge of the wall.
 OUTSIDE = 0.30
@@ -58,12 +58,15 @@ class TrifingerRepose(Task):
 
     Group: turns by 120 degrees. Action: torques, in units of 0.36 N m, less a safety damping that the
     platform adds. Observation: joint positions and velocities, cube pose, goal pose, last action. Where the
-    goal has no orientation (difficulty 1 to 3), its quaternion is observed as zeros: they are invariant, as
-    no constant orientation is, and say nothing that a policy would have to learn to ignore.
+    goal has no orientation (difficulty 1 to 3, without ``yaw``), its quaternion is observed as zeros: they
+    are invariant, as no constant orientation is, and say nothing that a policy would have to learn to
+    ignore.
 
     Args:
         difficulty: 1, a place on the table; 2, 82.5 mm above the middle; 3, a place up to 0.1 m high;
             4, the same with an orientation.
+        yaw: at difficulty 1, goals also have a heading: that of the cube at the start, turned by at most
+            this, rad; less at lower levels. None: any heading will do.
         radius: of the disc of start and goal positions, m; at most and by default 0.1387.
         curriculum: start near the middle, where pushing is easy, and move outwards with success; if not,
             every episode draws from the whole disc.
@@ -98,6 +101,7 @@ class TrifingerRepose(Task):
         self,
         *,
         difficulty: int = 1,
+        yaw: float | None = None,
         radius: float = ARENA,
         curriculum: bool = True,
         episode_seconds: float | None = None,
@@ -108,6 +112,11 @@ class TrifingerRepose(Task):
     ) -> None:
         if difficulty not in (1, 2, 3, 4):
             raise ValueError(f"expected a difficulty of 1, 2, 3 or 4, got {difficulty!r}")
+        if yaw is not None and not (difficulty == 1 and 0 < yaw <= math.pi):
+            raise ValueError(
+                f"expected a yaw in (0, pi] rad at difficulty 1, got {yaw} at {difficulty}; difficulty 4 has "
+                "orientations of its own"
+            )
         if not 0 < radius <= ARENA or weak_finger not in (None, 0, 1, 2):
             raise ValueError(
                 f"expected a radius in (0, {ARENA}] m and a weak_finger among 0, 1, 2 or None, got "
@@ -115,7 +124,8 @@ class TrifingerRepose(Task):
             )
         check_range("cube_mass", cube_mass, above=0.0)
         check_range("friction", friction, above=0.0)
-        self.difficulty, self.radius = difficulty, radius
+        self.difficulty, self.yaw, self.radius = difficulty, yaw, radius
+        self.oriented = difficulty == 4 or yaw is not None
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
         edit = _edit(physics_timestep, weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
@@ -127,7 +137,7 @@ class TrifingerRepose(Task):
         signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
         self._corners = torch.cartesian_prod(signs, signs, signs)
         self.curriculum = curriculum
-        self.averages = Averages("success", "error", "level")
+        self.averages = Averages("success", "error", "level", *["angle"] * self.oriented)
 
     def layout(self) -> tuple[Entry, ...]:
         """Joints, cube, goal, last action."""
@@ -166,7 +176,10 @@ class TrifingerRepose(Task):
         whole = finished.time > self.episode_seconds - self.control_timestep / 2
         whole |= self.terminated(finished)
         success, error = whole & self.success(finished), self.position_error(finished)
-        self.averages.update(success=success[whole], error=error[whole], level=level[whole])
+        ended = {"success": success, "error": error, "level": level}
+        if self.oriented:
+            ended["angle"] = self.orientation_error(finished)
+        self.averages.update(**{name: figure[whole] for name, figure in ended.items()})
         if not self.curriculum:
             return self.sample_initial_state(len(finished), generator)
         failure = whole & ~success & (error > FAILURE_DISTANCE)
@@ -189,6 +202,9 @@ class TrifingerRepose(Task):
         if self.difficulty != 2:
             goal[:, 0, :2] = _place(radius, right, u[:, 13])
         orientation = qpos[:, 12:16].clone()  # shown where the goal has none
+        if self.yaw is not None:
+            half = half + (2 * u[:, 15] - 1) * (self.yaw / 2) * (1 + level) / (1 + LAST_LEVEL)
+            orientation[:, 0], orientation[:, 3] = half.cos(), half.sin()
         if self.difficulty == 4:
             drawn = torch.randn(n, 4, generator=generator, dtype=torch.float64)
             orientation = drawn / drawn.norm(dim=-1, keepdim=True)
@@ -240,7 +256,7 @@ class TrifingerRepose(Task):
         observation[:, 18:21] = state.qpos[:, 9:12] * POSITION_SCALE
         observation[:, 21:25] = state.qpos[:, 12:16]
         observation[:, 25:28] = state.mocap_pos[:, 0] * POSITION_SCALE
-        if self.difficulty == 4:
+        if self.oriented:
             observation[:, 28:32] = state.mocap_quat[:, 0]
         observation[:, 32:41] = state.variables["last_action"]
         return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
@@ -288,7 +304,7 @@ class TrifingerRepose(Task):
 
     def _keypoint_distance(self, state: State) -> Tensor:
         """Distance of the cube's corners from the goal's, ``(n, 8)``, m; or of the centres, ``(n, 1)``."""
-        if self.difficulty < 4:  # without an orientation, all corners are off by the same
+        if not self.oriented:  # then all corners are off by the same
             return self.position_error(state)[:, None]
         assert state.mocap_pos is not None and state.mocap_quat is not None
         turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_quat[:, 0])
@@ -315,13 +331,13 @@ class TrifingerRepose(Task):
         return (x.square() + y.square() > OUTSIDE**2) | (z.abs() > OUTSIDE)
 
     def success(self, state: State) -> Tensor:
-        """Within 3 cm of the goal at difficulty 1, else within 2 cm; at difficulty 4 and 0.4 rad."""
+        """Within 3 cm of the goal at difficulty 1, else within 2 cm; within 0.4 rad of its orientation."""
         limit = PLANAR_DISTANCE if self.difficulty == 1 else SUCCESS_DISTANCE
         close = self.position_error(state) < limit
-        return close & (self.orientation_error(state) < SUCCESS_ANGLE) if self.difficulty == 4 else close
+        return close & (self.orientation_error(state) < SUCCESS_ANGLE) if self.oriented else close
 
     def metrics(self) -> dict[str, float]:
-        """Success rate, mean final position error (m) and mean level of about the last 500 episodes."""
+        """Success rate, final errors (m, rad) and level, means of about the last 500 episodes."""
         return dict(self.averages.values)
 
     def state_dict(self) -> dict[str, Any]:

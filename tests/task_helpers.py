@@ -18,7 +18,7 @@ SETTINGS = {
         {"friction": (0.5, 1.2), "added_mass": (-2.0, 4.0), "physics_timestep": 0.01},
     ),
     "anymal_climb": ({"phase": "A"}, {"phase": "C", "curriculum": False, "height": 0.3}),
-    "trifinger_repose": ({"difficulty": 1}, {"difficulty": 2}, {"difficulty": 4}),
+    "trifinger_repose": ({"difficulty": 2}, {"difficulty": 4}, {"yaw": 1.0}),
 }
 all_settings = pytest.mark.parametrize(
     ("name", "kwargs"), [(name, kwargs) for name in tasks.ALL_TASKS for kwargs in SETTINGS[name]]

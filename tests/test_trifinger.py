@@ -301,15 +301,33 @@ def test_success_moves_starts_outwards_and_failure_inwards():
     assert (task.restart(state, generator()).variables["level"] == 3.0).all()
 
 
+def test_a_goal_on_the_table_can_have_a_heading():
+    task = TrifingerRepose(yaw=1.0)
+    state = task.sample_goal_state(2000, generator())
+    error = task.orientation_error(state)
+    assert 0.95 < float(error.max()) <= 1.0 and float(error.min()) < 0.05
+    assert float(task.orientation_error(task.sample_initial_state(500, generator())).max()) <= 1 / 8
+    torch.testing.assert_close(state.mocap_quat[:, 0, 1:3], torch.zeros(2000, 2).double())
+    assert (task.observe(state)[:, 28:32] == state.mocap_quat[:, 0].float()).all()
+    for quaternion_ in (state.qpos[:, 12:16], state.mocap_quat[:, 0]):  # both signs, equally often
+        assert float((quaternion_[:, 0] > 0).double().mean()) == pytest.approx(0.5, abs=0.05)
+    assert float((state.qpos[:, 12:16] * state.mocap_quat[:, 0]).sum(-1).min()) > 0, "signs agree"
+    state.qpos[:, 9:12] = state.mocap_pos[:, 0]
+    assert (task.success(state) == (error < 0.4)).all()
+    assert set(task.metrics()) == {"success", "error", "level", "angle"}
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
         {"difficulty": 5},
+        {"difficulty": 4, "yaw": 1.0},
+        {"yaw": 4.0},
         {"radius": 0.2},
         {"weak_finger": 3},
         {"friction": (0.0, 1.0)},
     ],
 )
 def test_wrong_arguments_are_named(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with pytest.raises(ValueError, match=list(wrong)[-1]):
         TrifingerRepose(**wrong)
