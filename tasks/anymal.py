@@ -226,6 +226,11 @@ class Anymal(Task):
             "action_rate": change.square().sum(-1),
         }
 
+    def behaviour(self, state: State) -> dict[str, Tensor]:
+        """How far the robot turns about the vertical, rad: to and fro adds up."""
+        yaw_rate = (rotation(state)[:, 2] * state.qvel[:, 3:6]).sum(dim=-1)
+        return {"turning": yaw_rate.abs() * self.control_timestep}
+
     def fallen(self, state: State, lowest: float) -> Tensor:
         """Tilted by more than 60 degrees, or with the base below a height over the ground, ``(n,)``."""
         base = state.qpos[:, None, 0:3]

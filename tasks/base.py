@@ -225,6 +225,14 @@ class Task(abc.ABC):
         """Whether an episode that ends in ``state`` reached its goal, ``(n,)`` bool; None: undefined."""
         return None
 
+    def behaviour(self, state: State) -> dict[str, Tensor]:
+        """What the robot does in the step that led to ``state``, whatever it is paid for, ``(n,)`` each.
+
+        Evaluations add it up over an episode (how far did it turn?); empty by default. Invariant under
+        the group, like the reward, or goals could not be compared.
+        """
+        return {}
+
     def transform_state(self, state: State, g: Element) -> State:
         """L_g on the full state, task variables included; a new state.
 

@@ -35,6 +35,8 @@ class Evaluation:
         terms: mean total per episode of every reward term by name, ``(N,)`` float64 each; they add up to
             the mean returns.
         task_terms: the terms that make up the task, as opposed to gait and effort; may be empty.
+        behaviour: mean total per episode of what the robot did, ``(N,)`` float64 each, by name
+            (:meth:`~tasks.base.Task.behaviour`); may be empty.
 
     Example:
         >>> import torch
@@ -48,6 +50,7 @@ class Evaluation:
     successes: Tensor | None = None
     terms: dict[str, Tensor] = field(default_factory=dict)
     task_terms: tuple[str, ...] = ()
+    behaviour: dict[str, Tensor] = field(default_factory=dict)
 
     @property
     def goal_means(self) -> dict[str, float]:
@@ -81,6 +84,12 @@ class Evaluation:
         if not self.task_terms:
             return {}
         return self._by_goal(torch.stack([self.terms[name] for name in self.task_terms]).sum(dim=0))
+
+    @property
+    def goal_behaviours(self) -> dict[str, dict[str, float]]:
+        """Mean figures of behaviour of each goal: ``{goal: {name: mean}}``."""
+        each = {name: self._by_goal(values) for name, values in self.behaviour.items()}
+        return {goal: {name: values[goal] for name, values in each.items()} for goal in self.goal_names}
 
     def _by_goal(self, values: Tensor) -> dict[str, float]:
         return dict(zip(self.goal_names, values.tolist(), strict=True))
@@ -140,14 +149,19 @@ def evaluate(
     batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, device=device)
     noise_seed = int(torch.randint(2**31, (), generator=generator))  # not the stream of the starts
     with torch.no_grad(), set_exploration_type(exploration), _seeded(noise_seed):
-        returns, successes, terms = _run(batched, policy, batched.reset_to(starts))
+        returns, successes, terms, behaviour = _run(batched, policy, batched.reset_to(starts))
     shape = (order, episodes)
+
+    def by_goal(totals: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: x.reshape(shape).mean(dim=1) for name, x in totals.items()}
+
     return Evaluation(
         task.goal_names,
         returns.reshape(shape).cpu(),
         None if successes is None else successes.reshape(shape),
-        {name: x.reshape(shape).mean(dim=1) for name, x in terms.items()},
+        by_goal(terms),
         task.task_terms,
+        by_goal(behaviour),
     )
 
 
@@ -166,13 +180,14 @@ def _run(
     env: BatchedEnv,
     policy: Callable[[TensorDictBase], TensorDictBase],
     tensordict: TensorDictBase,
-) -> tuple[Tensor, Tensor | None, dict[str, Tensor]]:
-    """First episode of every row: return ``(n, 1)``, success ``(n,)`` and total of each term ``(n,)``."""
+) -> tuple[Tensor, Tensor | None, dict[str, Tensor], dict[str, Tensor]]:
+    """First episode of every row: return ``(n, 1)``, success, totals of terms and behaviour, ``(n,)``."""
     task = env.task
     running = ~tensordict["done"]
     returns = torch.zeros(running.shape, dtype=torch.float64, device=running.device)
     successes = task.success(env.state)  # every entry is replaced where its episode ends
-    totals: dict[str, Tensor] = {}
+    terms: dict[str, Tensor] = {}
+    behaviour: dict[str, Tensor] = {}
     while bool(running.any()):
         before = env.state.variables
         tensordict = env.step(policy(tensordict))
@@ -185,8 +200,12 @@ def _run(
             assert reached is not None
             successes = torch.where(ended.squeeze(-1).cpu(), reached & counted, successes)
         state.variables = before  # the reward sees the variables from before the step
-        for name, value in task.reward_terms(state, tensordict["action"].cpu()).items():
-            totals[name] = totals.get(name, 0.0) + value.double().masked_fill(~counted, 0.0)
+        for totals, step in (
+            (terms, task.reward_terms(state, tensordict["action"].cpu())),
+            (behaviour, task.behaviour(state)),
+        ):
+            for name, value in step.items():
+                totals[name] = totals.get(name, 0.0) + value.double().masked_fill(~counted, 0.0)
         running &= ~ended
         tensordict = step_mdp(tensordict)
-    return returns, successes, totals
+    return returns, successes, terms, behaviour

@@ -168,6 +168,20 @@ def test_fallen_means_tilted_by_60_degrees_or_low():
     assert torch.equal(task.terminated(state), task.fallen(state, 0.22))
 
 
+def test_turning_is_the_yaw_travelled_and_the_same_for_mirror_images():
+    task = AnymalPush()
+    state = tumbling(task)
+    turning = task.behaviour(state)["turning"]
+    vertical = [
+        torch.from_numpy(kinematics(task, state, row).body("base").xmat[6:].copy()) for row in range(32)
+    ]
+    spin = (torch.stack(vertical) * state.qvel[:, 3:6]).sum(-1)
+    torch.testing.assert_close(turning, 0.02 * spin.abs())
+    for g in range(4):
+        image = task.behaviour(task.transform_state(state, g))["turning"]
+        torch.testing.assert_close(image, turning)
+
+
 def test_a_payload_is_fixed_on_the_base_and_touches_nothing():
     plain = AnymalPush().model
     loaded = AnymalPush(payload=3.0, payload_position=(0.1, -0.05, 0.2)).model

@@ -199,4 +199,18 @@ def test_terms_of_every_task_add_up_to_its_return(name):
     result = evaluate(env, policy, 2, num_threads=1)
     assert result.returns.shape == (len(env.task.goal_names), 2)
     torch.testing.assert_close(sum(result.terms.values()), result.returns.mean(dim=1), **CLOSE)
+    assert set(result.behaviour) == ({"turning"} if name.startswith("anymal") else set())
     assert set(result.task_means) == set(env.task.goal_names)
+
+
+def test_behaviour_adds_up_over_the_episode_goal_by_goal():
+    class Spinning(Measured):
+        def behaviour(self, state):
+            return {"path": state.qvel[:, 1].abs() * self.control_timestep, "steps": torch.ones(len(state))}
+
+    env = BatchedEnv(Spinning(episode_seconds=1.0), 1, num_threads=1)
+    result = evaluate(env, noisy(), 3, num_threads=1)
+    torch.testing.assert_close(result.behaviour["steps"], 2 * result.terms["alive"])
+    assert set(result.goal_behaviours) == {"right", "left"}
+    assert result.goal_behaviours["left"]["path"] == pytest.approx(float(result.behaviour["path"][1]))
+    assert result.goal_behaviours["left"]["path"] > 0

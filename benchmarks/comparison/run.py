@@ -189,13 +189,14 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
 
 
 def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
-    """Return, return of the task's own terms and success rate of every goal; None where undefined."""
+    """Return, return of the task's own terms, success rate and behaviour of every goal; None if undefined."""
     return [
         {
             "goal": goal,
             "return": value,
             "task_return": outcome.task_means.get(goal),
             "success": outcome.goal_successes.get(goal),
+            **outcome.goal_behaviours[goal],
         }
         for goal, value in outcome.goal_means.items()
     ]
