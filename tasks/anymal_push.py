@@ -28,13 +28,10 @@ NEAREST_TARGET, TARGET_STEP, LAST_LEVEL = 0.3, 0.15, 7
 SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
 # Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
 STOP_DISTANCE = 0.12
-# The speed asked for, m/s, and the point asked for: behind the cube as seen from the target, by this much,
-# m, plus the robot's distance from the line through cube and target, up to a limit. So a robot beside the
-# line is asked to get behind the cube before it pushes on. Near the target the speed falls in proportion to
-# the distance left, to a third: a cube that is pushed past its target is hard to get back. The tolerance of
-# the velocity's reward falls with it, or standing still short of the target would pay nearly as well.
-SPEED, BEHIND, DETOUR = 0.6, 0.3, 0.6
-SLOW_DISTANCE, SLOWEST = 0.5, 0.2
+# The speed asked for, m/s. Near the target it falls in proportion to the distance left, to a third: a cube
+# that is pushed past its target is hard to get back. The tolerance of the velocity's reward falls with it, or
+# standing still short of the target would pay nearly as well.
+SPEED, SLOW_DISTANCE, SLOWEST = 0.6, 0.5, 0.2
 TOLERANCE = 0.8  # of the speed asked for: standing still earns a fifth
 BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
 FALL_PENALTY = 5.0
@@ -174,10 +171,9 @@ class AnymalPush(Anymal):
         pushing = distance > STOP_DISTANCE
         ahead = gap / distance.clamp(min=1e-6)[:, None]
         to_cube = state.qpos[:, 19:21] - state.qpos[:, 0:2]
-        aside = (to_cube[:, 0] * ahead[:, 1] - to_cube[:, 1] * ahead[:, 0]).abs().clamp(max=DETOUR)
-        to_point = to_cube - (BEHIND + aside)[:, None] * ahead
+        toward = to_cube / to_cube.norm(dim=-1).clamp(min=1e-6)[:, None]
         speed = (SPEED * distance / SLOW_DISTANCE).clamp(SLOWEST, SPEED)
-        asked = to_point * (speed * pushing / to_point.norm(dim=-1).clamp(min=1e-6))[:, None]
+        asked = dipole(toward, ahead) * (speed * pushing)[:, None]
         miss = (velocity[:, :2] - asked).square().sum(-1) / (TOLERANCE * speed).square()
         progress = (state.variables["distance"][:, 0] - distance) / self.control_timestep
         terms = {
@@ -216,3 +212,23 @@ class AnymalPush(Anymal):
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         self.averages.values = dict(saved["averages"])
+
+
+def dipole(toward: Tensor, ahead: Tensor) -> Tensor:
+    """Which way a robot pushes an object to a target: along a dipole field, ``(n, 2)`` unit vectors.
+
+    Straight on from behind the object, around it from beside it, and away from it where it stands between
+    object and target (Igarashi, Kamiyama and Inami, "A dipole field for object delivery by pushing on a flat
+    surface", ICRA 2010): with r the direction to the object and e the one from there to the target,
+    u = 2 (e . r) r - e.
+
+    Args:
+        toward: direction from the robot to the object, ``(n, 2)``, unit vectors.
+        ahead: direction from the object to its target, ``(n, 2)``, unit vectors.
+
+    Example:
+        >>> beside, ahead = torch.tensor([[0.0, -1.0]]), torch.tensor([[1.0, 0.0]])
+        >>> dipole(beside, ahead)  # first get behind it
+        tensor([[-1., -0.]])
+    """
+    return 2 * (ahead * toward).sum(-1, keepdim=True) * toward - ahead

@@ -17,6 +17,7 @@ from tasks.anymal_push import (
     TASK_WEIGHTS,
     TOLERANCE,
     AnymalPush,
+    dipole,
 )
 from tasks.environment import BatchedEnv
 from tasks.state import concatenate
@@ -84,6 +85,31 @@ def test_reward_by_hand():
     assert task.reward_terms(state, zeros(state))["velocity"].item() == pytest.approx(weight["velocity"])
     state.qpos[0, 19:21] = state.mocap_pos[0, 0, :2]
     assert task.reward_terms(state, zeros(state))["tracking"].item() == pytest.approx(weight["tracking"])
+
+
+def directions(angle):
+    return torch.stack([angle.cos(), angle.sin()], dim=-1)
+
+
+def test_the_robot_is_asked_round_the_cube_along_a_dipole_field():
+    ahead = torch.tensor([[1.0, 0.0]]).double().expand(4, 2)
+    toward = torch.tensor([[1.0, 0], [0, 1.0], [0, -1.0], [-1.0, 0]]).double()
+    # Behind the cube: on. Beside it: back along the line of pushing. In front of it: away from the cube.
+    expected = torch.tensor([[1.0, 0], [-1.0, 0], [-1.0, 0], [1.0, 0]]).double()
+    torch.testing.assert_close(dipole(toward, ahead), expected)
+    angle = torch.linspace(-3, 3, 50, dtype=torch.float64)
+    field = dipole(directions(angle), directions(torch.zeros(50).double()))
+    torch.testing.assert_close(field.norm(dim=-1), torch.ones(50).double())
+    # Followed from anywhere but straight ahead of it, it leads to the cube from behind.
+    place, there = -directions(angle[5:-5]), torch.zeros(40, dtype=torch.bool)
+    for _ in range(500):
+        toward = -place / place.norm(dim=-1, keepdim=True)
+        there |= place.norm(dim=-1) < 0.1
+        place = torch.where(there[:, None], place, place + 0.01 * dipole(toward, ahead[:1].expand(40, 2)))
+    assert there.all()
+    torch.testing.assert_close(
+        -place / place.norm(dim=-1, keepdim=True), ahead[:1].expand(40, 2), rtol=0, atol=0.3
+    )
 
 
 def test_progress_pays_for_the_distance_covered_and_takes_it_back():
