@@ -4,7 +4,8 @@
 
 Figures: `training` (the paper's learning curves of return and symmetry loss), `log_prob` (its log action
 probabilities of augmented samples, original rule against naive), `initialization` (its study of initial
-weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a return, over steps and time).
+weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a return, over steps and time),
+`success` (of training, and the curriculum), `phases` (every seed's return through the curriculum's phases).
 Lines are interquartile means over seeds, bands their 95 % bootstrap intervals. `tables.md` has the numbers.
 """
 
@@ -21,7 +22,7 @@ from matplotlib.axes import Axes
 from comparison.intervals import band, iqm
 from comparison.methods import label, parts
 from comparison.study import Study, read
-from comparison.tables import seconds_per_step, steps_to, tables, threshold
+from comparison.tables import has_success, seconds_per_step, steps_to, tables, threshold
 
 HERE = Path(__file__).parent
 COLORS = {
@@ -46,6 +47,8 @@ def draw_all(results: Path, plots: Path) -> list[Path]:
         "initialization": initialization(study),
         "goals": goals(study),
         "efficiency": efficiency(study),
+        "success": success(study),
+        "phases": phases(study),
     }
     written = []
     for name, figure in drawn.items():
@@ -180,14 +183,54 @@ def share_limits(axes: Iterable[Axes]) -> None:
         axis.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
 
 
+def success(study: Study):
+    """Success and level of the curriculum while training."""
+    shown = [task for task in study.tasks if has_success(study, task)]
+    if not shown:
+        return None
+    figure, panels = pairs(len(shown))
+    for (top, bottom), task in zip(panels, shown, strict=True):
+        for method in compared(study.methods(task)):
+            draw_curve(top, study, task, method, "success")
+            draw_curve(bottom, study, task, method, "level")
+        top.set(title=task, xlabel=STEPS, ylabel="success in training", ylim=(0, 1))
+        bottom.set(xlabel=STEPS, ylabel="level of the curriculum")
+        legend(bottom)
+    return figure
+
+
+def phases(study: Study):
+    """Every seed's training return, with a mark where its curriculum enters another phase."""
+    shown = [task for task in study.tasks if "phase" in next(iter(study.curves_of_task(task)), {})]
+    if not shown:
+        return None
+    methods = compared(study.methods(shown[0]))
+    figure, axes = grid(1, len(methods), 3.4)
+    for axis, method in zip(axes[0], methods, strict=True):
+        for own in study.curves_of(shown[0], method).values():
+            steps = own["frames"] / 1e6
+            axis.plot(steps, own["return"], color=color(method), linewidth=0.9, alpha=0.8)
+            entered = np.flatnonzero(np.diff(own["phase"]) > 0) + 1
+            for at in entered:
+                axis.plot(steps[at], own["return"][at], "o", color="black", markersize=3)
+                name = "ABC"[int(own["phase"][at])]
+                axis.annotate(name, (steps[at], own["return"][at]), (0, 5), textcoords="offset points")
+        axis.set(title=f"{shown[0]}: {label(method)}", xlabel=STEPS)
+    axes[0, 0].set_ylabel("training return, per seed")
+    share_limits(axes[0])
+    return figure
+
+
 def goals(study: Study):
-    """Evaluated return of every equivalent goal, one vertical line per seed."""
+    """Evaluated return of every equivalent goal, one vertical line per seed; success where there is one."""
     figure, axes = grid(1, len(study.tasks), 6.4, 4.2)
     markers = "><^vDs"
     for axis, task in zip(axes[0], study.tasks, strict=True):
         methods, legend_goals = study.methods(task), []
+        succeeds = has_success(study, task)
+        which = {"column": "success", "actions": "sampled"} if succeeds else {}
         for place, method in enumerate(methods):
-            names, values = study.goal_returns(task, method)
+            names, values = study.goal_returns(task, method, **which)
             offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(len(values))
             for x, row in zip(place + offsets, values, strict=True):
                 axis.plot([x, x], [row.min(), row.max()], color=color(method), linewidth=1, alpha=0.6)
@@ -198,7 +241,8 @@ def goals(study: Study):
             range(len(methods)), [label(m) for m in methods], rotation=40, ha="right", fontsize=7.5
         )
         what = ", ".join(f"{m} {name}" for m, name in zip("▸◂▴▾◆■", legend_goals, strict=False))
-        axis.set(title=f"{task}: {what}", ylabel="mean return of a goal, per seed")
+        measured = "success rate" if succeeds else "mean return"
+        axis.set(title=f"{task}: {what}", ylabel=f"{measured} of a goal, per seed")
         axis.grid(axis="x", visible=False)
     return figure
 

@@ -257,8 +257,11 @@ class BatchedEnv(EnvBase):
         )
 
     def metrics(self) -> dict[str, float]:
-        """Simulations that diverged so far, and what the task measures of training (success, level)."""
-        return {"diverged": float(self.num_diverged), **self.task.metrics()}
+        """How training goes: what the task measures (success, level), simulations that diverged so far, and
+        seconds of physics since the last call."""
+        seconds, self.simulation.seconds = self.simulation.seconds, 0.0
+        own = {"diverged": float(self.num_diverged), "physics_seconds": seconds}
+        return own | self.task.metrics()
 
     def save_state(self) -> dict[str, Any]:
         """Everything that decides the future of this environment, as copied tensors.

@@ -13,6 +13,7 @@ do not depend on the number of threads, so that a seed reproduces a run on any m
 from __future__ import annotations
 
 import math
+import time
 
 import mujoco
 import torch
@@ -26,7 +27,7 @@ class Simulation:
     The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``time`` (n,), ``ctrl`` (n, nu),
     ``mocap_pos`` (n, nmocap, 3) and ``mocap_quat`` (n, nmocap, 4) are live float64 views of the
     simulations' memory in MuJoCo's units (m, rad, s, N): they change with every step, so copy what
-    you keep. Start episodes with :meth:`write`, not through the views: it also clears what the
+    you keep. ``seconds`` is the time spent stepping so far. Start episodes with :meth:`write`, not through the views: it also clears what the
     solver remembers.
 
     Args:
@@ -80,6 +81,7 @@ class Simulation:
         self._none_diverged = torch.zeros(num_envs, dtype=torch.bool)
         self._diverged = self._none_diverged
         self._expanded: dict[str, Tensor] = {}
+        self.seconds = 0.0  # spent stepping
 
     def _view(self, name: str) -> Tensor:
         return torch.from_numpy(self._batch.bind(name))
@@ -108,11 +110,13 @@ class Simulation:
         if not math.isfinite(float(ctrl.sum())):
             diverged = ~self.ctrl.isfinite().all(dim=-1)
             self.ctrl[diverged] = 0.0
+        start = time.perf_counter()
         try:
             self._batch.step(None if ids is None else ids.numpy(), nstep=substeps)
         except SimulationError as error:  # only the rows in error.ids failed
             diverged = diverged.clone()
             diverged[torch.as_tensor(error.ids, dtype=torch.int64)] = True
+        self.seconds += time.perf_counter() - start
         self._diverged = diverged | self._lost() if self._any_lost() else diverged
         if self._diverged is self._none_diverged:
             return False

@@ -25,7 +25,7 @@ from tasks.settings import SETTINGS
 ROOT = Path(__file__).parents[1]
 FIGURES = {"training.png", "log_prob.png", "initialization.png", "goals.png", "efficiency.png"}
 TINY = ["--config", "num_envs=8", "horizon=25", "epochs=1", "minibatches=1", "checkpoint_interval=2"]
-TIMING = ("seconds",)
+TIMING = ("seconds", "collect_seconds", "physics_seconds")
 
 # Tasks of a user: one whose processes die or fail for some seeds, one that is no BatchedEnv, one without
 # numbers to learn from.

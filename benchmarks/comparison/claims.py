@@ -47,25 +47,25 @@ def claim(text: str, place: str) -> Callable[[Callable[[Study], Judgement]], Cal
     return register
 
 
-def returns(study: Study, method: str) -> np.ndarray:
-    """Evaluated return of every seed."""
-    return study.goal_returns(TASK, method)[1].mean(axis=1)
+def returns(study: Study, method: str, task: str = TASK, **which: str) -> np.ndarray:
+    """Evaluated return of every seed, or what else `Study.goal_returns` is asked for."""
+    return study.goal_returns(task, method, **which)[1].mean(axis=1)
 
 
-def variations(study: Study, method: str) -> np.ndarray:
+def variations(study: Study, method: str, task: str = TASK, **which: str) -> np.ndarray:
     """Difference between the goals, of every seed."""
-    return variation(study.goal_returns(TASK, method)[1])
+    return variation(study.goal_returns(task, method, **which)[1])
 
 
-def symmetry_loss(study: Study, method: str) -> np.ndarray:
+def symmetry_loss(study: Study, method: str, task: str = TASK) -> np.ndarray:
     """Decimal logarithm of the last symmetry loss of every seed."""
-    return np.log10(np.maximum(study.curve(TASK, method, "mirror_loss")[1][:, -1], 1e-12))
+    return np.log10(np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12))
 
 
-def steps(study: Study, method: str) -> np.ndarray:
+def steps(study: Study, method: str, task: str = TASK) -> np.ndarray:
     """Million steps to the threshold; seeds that never reach it count as the whole run."""
-    reached = steps_to(study, TASK, method, threshold(study, TASK))
-    return np.minimum(reached, study.curve(TASK, method, "return")[0][-1])
+    reached = steps_to(study, task, method, threshold(study, task))
+    return np.minimum(reached, study.curve(task, method, "return")[0][-1])
 
 
 def own_steps(study: Study, method: str) -> np.ndarray:
@@ -73,9 +73,9 @@ def own_steps(study: Study, method: str) -> np.ndarray:
     return steps_to_own(study, TASK, method)
 
 
-def reached(study: Study, method: str) -> tuple[int, int]:
+def reached(study: Study, method: str, task: str = TASK) -> tuple[int, int]:
     """How many seeds reach the threshold, and how many there are."""
-    found = np.isfinite(steps_to(study, TASK, method, threshold(study, TASK)))
+    found = np.isfinite(steps_to(study, task, method, threshold(study, task)))
     return int(found.sum()), len(found)
 
 

@@ -3,6 +3,8 @@
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
 * `study.json`: command, commit, versions, machine; hyper-parameters per task and method; what failed.
+* `checkpoints/TASK/METHOD`: the policy of the seed with the highest evaluated return, where there is success
+  to look at, for `examples/watch.py` and `behaviour.py`.
 """
 
 import csv
@@ -17,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from comparison.provenance import provenance
-from comparison.run import Run, read_curve, write_json
+from comparison.run import Run, read_curve, stage_folders, write_json
+from torchrl_sym.recipes import export_actor
 
 RUN = ("task", "method", "seed")
-EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")
+EVALUATION = ("what", "actions", "goal", "return", "task_return", "success", "turning")
 CURVE = (
     *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
-    *("std", "learning_rate", "kl", "success", "level", "phase"),
+    *("std", "learning_rate", "kl", "success", "level", "phase", "collect_seconds", "physics_seconds"),
 )
 POINTS = 105  # rows per curve that are kept, at most
 
@@ -46,6 +49,7 @@ def write(
     """
     folder.mkdir(parents=True, exist_ok=True)
     evaluated, curves, methods, revisions, episodes = [], [], {}, set(), set()
+    best: dict[tuple[str, str], list[tuple[float, Run]]] = {}
     for run in runs:
         result = run.result()
         if result is None:
@@ -56,6 +60,9 @@ def write(
         rows = result["evaluation"] or [{}]
         episodes.add(result["episodes"])
         evaluated += [name | ended | row for row in rows]
+        if rows[0].get("success") is not None:
+            score = float(np.mean([row["return"] for row in rows if row["actions"] == "sampled"]))
+            best.setdefault((run.task, run.method), []).append((score, run))
         curve = read_curve(run.folder)
         every = math.ceil(
             run.iterations / points
@@ -64,6 +71,9 @@ def write(
         curves += [name | row for row in kept]
         revisions.add(result["revision"])
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
+    for runs_of_method in best.values():
+        _, run = max(runs_of_method, key=lambda pair: pair[0])
+        export_actor(stage_folders(run.folder)[-1], folder / "checkpoints" / run.task / run.method)
     _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
@@ -135,13 +145,30 @@ class Study:
         values = np.array(values)
         return steps / 1e6, values[np.isfinite(values[:, -1])]
 
+    def evaluations(self, task: str) -> list[str]:
+        """What was evaluated after training on a task, in order."""
+        return list(dict.fromkeys(r["what"] for r in self.runs if r["task"] == task and r.get("what")))
+
     def goal_returns(
-        self, task: str, method: str, column: str = "return", actions: str = "deterministic"
+        self,
+        task: str,
+        method: str,
+        column: str = "return",
+        actions: str = "deterministic",
+        what: str | None = None,
     ) -> tuple[list[str], np.ndarray]:
-        """Names of the goals, and their mean returns ``(seeds, goals)`` in the first evaluation."""
-        rows = [r for r in self._rows(task, method) if r.get("actions") == actions]
-        first = rows[0]["what"] if rows else None
-        rows = [r for r in rows if r["what"] == first]
+        """Names of the goals, and their mean returns ``(seeds, goals)``, or another column of `runs.csv`.
+
+        Args:
+            task: a task of the study.
+            method: one of its methods.
+            column: `return`, `task_return`, `success`, `turning`.
+            actions: `deterministic` (mean actions) or `sampled`.
+            what: one of the task's evaluations; the first by default.
+        """
+        what = what or next(iter(self.evaluations(task)), None)
+        rows = self._rows(task, method)
+        rows = [r for r in rows if r.get("actions") == actions and r.get("what") == what]
         goals = list(dict.fromkeys(r["goal"] for r in rows))
         seeds = list(dict.fromkeys(r["seed"] for r in rows))
         found = {(r["seed"], r["goal"]): r.get(column) for r in rows}
@@ -155,6 +182,10 @@ class Study:
     def curves_of(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
         """Columns of a method's curves, by seed."""
         return {seed: c for (t, m, seed), c in self.curves.items() if (t, m) == (task, method)}
+
+    def curves_of_task(self, task: str) -> list[dict[str, np.ndarray]]:
+        """Columns of all curves of a task."""
+        return [c for (t, _, _), c in self.curves.items() if t == task]
 
     def _rows(self, task: str, method: str) -> list[dict[str, Any]]:
         return [row for row in self.runs if (row["task"], row["method"]) == (task, method)]

@@ -15,36 +15,28 @@ def tables(study: Study) -> str:
     text = f"Made by `{study.about['command']}` at {', '.join(study.about['revisions'])}, "
     text += f"{study.about['machine']}, {study.about['workers']} runs at a time.\n"
     for task in study.tasks:
-        text += f"\n## {task}\n\n{table_1(study, task)}\n{efficiency_table(study, task)}"
+        body = success_tables(study, task) if has_success(study, task) else table_1(study, task)
+        text += f"\n## {task}\n\n{body}\n{efficiency_table(study, task)}"
+        if has_split(study, task):
+            text += f"\n{throughput_table(study, task)}"
     return text
 
 
 def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
     """Return and variation between equivalent goals, per method (the paper's Table I)."""
     head = ["method", "seeds", "return", "variation", "largest variation", "symmetry loss"]
-    shown = methods or study.methods(task)
-    successes = {m: study.goal_returns(task, m, "success")[1] for m in shown}
-    has_success = any(np.isfinite(s).any() for s in successes.values())
-    rows = [[*head, "success", "worst goal"] if has_success else head]
-    rows.append(["---", *["---:"] * (len(rows[0]) - 1)])
-    for method in shown:
+    rows = [head, ["---", *["---:"] * (len(head) - 1)]]
+    for method in methods or study.methods(task):
         returns = study.goal_returns(task, method)[1]
-        seeds = len(study.seeds(task, method))
-        gone = len(study.diverged(task, method))
-        missing = seeds - len(returns)  # they diverged before their first checkpoint
-        row = [label(method), f"{seeds} ({gone} diverged, {missing} at once)" if gone else str(seeds)]
-        if missing == seeds:
-            rows.append([*row, *["-"] * (len(rows[0]) - 2)])
+        row = [label(method), seeds_of(study, task, method)]
+        if not len(returns):
+            rows.append([*row, *["-"] * (len(head) - 2)])
             continue
         variations = variation(returns)
         comparable = returns.shape[1] > 1
-        loss = np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12)
         row += [estimate(returns.mean(axis=1)).format()]
         row += [estimate(variations).format(), f"{variations.max():.3f}"] if comparable else ["-", "-"]
-        row += [f"{np.exp(iqm(np.log(loss))):.2g}"]
-        if has_success:
-            row += [f"{successes[method].mean():.1%}", f"{successes[method].mean(axis=0).min():.1%}"]
-        rows.append(row)
+        rows.append([*row, symmetry_loss(study, task, method)])
     note = (
         "*return*: mean over the equivalent goals, mean actions; *variation*: the largest difference\n"
         "between two goals; both as interquartile mean over seeds with its 95 % bootstrap interval.\n"
@@ -52,6 +44,92 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
         "distance of K_g[π(s)] from π(L_g[s]) on the states of the last iteration (interquartile mean of\n"
         "logarithms).\n"
     )
+    return markdown(rows) + "\n" + note
+
+
+def success_tables(study: Study, task: str, methods: list[str] | None = None) -> str:
+    """Table I for tasks that succeed or fail: a table per evaluation and kind of actions."""
+    kinds = {"sampled": "sampled actions, as in training", "deterministic": "mean actions"}
+    text = ""
+    for what in study.evaluations(task):
+        for actions, name in kinds.items():
+            title = name if what == "task" else f"{what}, {name}"
+            text += f"{title[0].upper()}{title[1:]}:\n\n"
+            text += success_table(study, task, methods, actions, what) + "\n"
+    return text + (
+        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the lowest\n"
+        "success of a goal (mean over seeds). *spread*: the largest difference between two goals of a seed, in\n"
+        "success (percentage points) or return. *task return*: without terms of gait and effort. *turning*:\n"
+        "yaw travelled in an episode. *symmetry loss*: as in the paper, on the last iteration's states.\n"
+    )
+
+
+def success_table(study: Study, task: str, methods: list[str] | None, actions: str, what: str) -> str:
+    """Success, task return and return of every method, each with its spread over the goals."""
+    head = ["method", "seeds", "success [%]", "worst goal", "spread", "task return", "spread", "return"]
+    head += ["spread", "symmetry loss"]
+    shown = methods or study.methods(task)
+    turns = {m: study.goal_returns(task, m, "turning", actions, what)[1] for m in shown}
+    turned = any(np.isfinite(values).any() for values in turns.values())
+    head += ["turning [rad]"] * turned
+    rows = [head, ["---", *["---:"] * (len(head) - 1)]]
+    for method in shown:
+        row = [label(method), seeds_of(study, task, method)]
+        success = 100 * study.goal_returns(task, method, "success", actions, what)[1]
+        if not len(success):
+            rows.append([*row, *["-"] * (len(head) - 2)])
+            continue
+        row += [estimate(success.mean(axis=1)).format(1), f"{success.mean(axis=0).min():.1f}"]
+        row += [estimate(variation(success)).format(1)]
+        for column in ("task_return", "return"):
+            values = study.goal_returns(task, method, column, actions, what)[1]
+            row += [estimate(values.mean(axis=1)).format(2), estimate(variation(values)).format(2)]
+        row += [symmetry_loss(study, task, method)]
+        row += [estimate(turns[method].mean(axis=1)).format(2)] * turned
+        rows.append(row)
+    return markdown(rows)
+
+
+def seeds_of(study: Study, task: str, method: str) -> str:
+    """How many seeds a method has, and how many of them diverged."""
+    seeds, gone = len(study.seeds(task, method)), len(study.diverged(task, method))
+    missing = seeds - len(study.goal_returns(task, method)[1])  # they diverged before a checkpoint
+    return f"{seeds} ({gone} diverged, {missing} at once)" if gone else str(seeds)
+
+
+def symmetry_loss(study: Study, task: str, method: str) -> str:
+    """Interquartile mean of the logarithm, at the end of training."""
+    loss = np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12)
+    return f"{np.exp(iqm(np.log(loss))):.2g}"
+
+
+def has_success(study: Study, task: str) -> bool:
+    """Whether episodes of a task succeed or fail."""
+    return any(row["task"] == task and row.get("success") is not None for row in study.runs)
+
+
+def has_split(study: Study, task: str) -> bool:
+    """Whether it was logged what the time of a task's training went into."""
+    return any("physics_seconds" in c for c in study.curves_of_task(task))
+
+
+def throughput_table(study: Study, task: str) -> str:
+    """Environment steps per second, learning included, and what the time goes into."""
+    rows = [["method", "steps per second, one core", "physics", "inference, rewards, resets", "update"]]
+    rows.append(["---", *["---:"] * 4])
+    for method in study.methods(task):
+        parts = []
+        for c in study.curves_of(task, method).values():
+            iterations = np.diff(c["iteration"])
+            whole = np.diff(c["seconds"])
+            same = iterations > 0  # not across two stages
+            each = whole[same] / iterations[same]
+            collect, physics = c["collect_seconds"][1:][same], c["physics_seconds"][1:][same]
+            parts.append(np.stack([physics, collect - physics, each - collect]) / each)
+        shares = np.median(np.concatenate(parts, axis=1), axis=1)
+        rate = 1 / seconds_per_step(study, task, method)
+        rows.append([label(method), f"{rate:,.0f}", *(f"{share:.0%}" for share in shares)])
+    note = "One process with one thread per run, as many at a time as cores: two cores do twice as much.\n"
     return markdown(rows) + "\n" + note
 
 

@@ -77,8 +77,9 @@ def train(
     Yields:
         iteration, frames, return (mean of the latest finished episodes), mirror_loss, log_prob and
         log_prob_copies (mean log pi_k of samples and of their copies), kl, every loss and diagnostic of
-        the updates, learning_rate, std, seconds, frames_per_second; and what the environment's own
-        ``metrics()`` returns, if it has any (success rate, level of the curriculum).
+        the updates, learning_rate, std, seconds, frames_per_second, collect_seconds (of this iteration's
+        data; the rest of its time is learning); and what the environment's own ``metrics()`` returns, if
+        it has any (success rate, level of the curriculum).
 
     Raises:
         ValueError: the folder holds a run with another configuration.
@@ -132,10 +133,12 @@ def train(
     )
     log = make_logger(logger, folder, name="train")
     bar = tqdm(total=config.iterations, initial=start, disable=not progress, unit="it")
-    clock = time.perf_counter() - elapsed
+    began = time.perf_counter()
+    clock = began - elapsed
     try:
         for iteration, data in enumerate(collector, start + 1):
             metrics = {"iteration": iteration, "frames": iteration * data.numel()}
+            metrics["collect_seconds"] = time.perf_counter() - began
             metrics["return"] = episodes.update(data)
             metrics |= call_env(env, "metrics") or {}
             metrics |= symmetry_metrics(actor, symmetry, data)
@@ -163,6 +166,7 @@ def train(
             if iteration >= config.iterations:
                 break
             collector.update_policy_weights_()
+            began = time.perf_counter()
     finally:
         bar.close()
         collector.shutdown(close_env=True)

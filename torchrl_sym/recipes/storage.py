@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torchrl.record.loggers import Logger, get_logger
 
-TIMING = ("seconds", "frames_per_second")
+TIMING = ("seconds", "frames_per_second", "collect_seconds", "physics_seconds")
 """Columns of ``metrics.csv`` that depend on the machine."""
 
 

@@ -1,0 +1,182 @@
+"""Pictures of what policies do on equivalent goals, from the checkpoints that a comparison keeps.
+
+    python benchmarks/behaviour.py paper-robots
+
+* `TASK_paths`: robot and object from above, as run and mapped back onto one goal (the paper's figure of
+  ANYmal-Push): what is symmetric leaves a single bundle of paths there.
+* `TASK_touches`: which limbs touch the object, goal by goal.
+* `TASK_frames`: key frames, one row per method and goal.
+
+Episodes are paired: every goal starts from the image of the same states. Drawn for the best seed of each
+method, with sampled actions.
+"""
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")  # read when mujoco is imported
+
+import matplotlib.pyplot as plt
+import mujoco
+import numpy as np
+import torch
+import tyro
+from torchrl.envs.utils import ExplorationType
+
+import tasks
+from comparison.methods import label
+from tasks.anymal import LEGS
+from tasks.base import Task
+from tasks.rendering import draw_paths, record, render, save, sheet
+from tasks.state import State, concatenate
+from torchrl_sym.recipes import load_actor
+
+HERE = Path(__file__).parent
+SEED = 2000  # of starts: not those of the evaluation
+FRAMES = 5  # key frames of an episode
+LIMBS = (*LEGS, "base")
+
+
+@dataclass
+class Arguments:
+    """Draw what the policies of a comparison do."""
+
+    name: tyro.conf.Positional[str] = "paper-robots"
+    """What the results are called."""
+    methods: tuple[str, ...] = ("ppo", "aug")
+    """Whose policies."""
+    episodes: int = 6
+    """Per goal, in the figures of paths."""
+    touching: int = 50
+    """Episodes per goal, in the figures of limbs."""
+    results: Path = HERE / "results"
+    """Where results are, in a folder of their name."""
+    plots: Path = HERE / "plots"
+    """Where pictures go, in a folder of the results' name."""
+
+
+@dataclass
+class Recording:
+    """Episodes of one policy: as many of every goal, goal by goal.
+
+    Attributes:
+        task: what was run.
+        states: all states, of all rows at a time.
+        elements: group element of every row.
+    """
+
+    task: Task
+    states: list[State]
+    elements: list[int]
+
+
+def play(task_name: str, checkpoint: Path, episodes: int) -> Recording:
+    """Episodes of all goals with sampled actions, from the images of the same starts."""
+    task = tasks.make_env(task_name, num_envs=1, seed=0).task
+    order = task.symmetry.group.order
+    elements = [g for g in range(order) for _ in range(episodes)]
+    env = tasks.make_env(task_name, num_envs=len(elements), num_threads=1, seed=0)
+    canonical = task.sample_goal_state(episodes, torch.Generator().manual_seed(SEED))
+    start = concatenate([task.transform_state(canonical, g) for g in range(order)])
+    torch.manual_seed(SEED)
+    actor = load_actor(checkpoint, env, env.symmetry)
+    return Recording(task, record(env, actor, start, exploration=ExplorationType.RANDOM), elements)
+
+
+def paths(recordings: dict[str, Recording]):
+    """A row per method: paths as run, and mapped back onto the first goal."""
+    size = (8, 3.9 * len(recordings) + 0.4)
+    figure, axes = plt.subplots(len(recordings), 2, figsize=size, layout="constrained", squeeze=False)
+    for row, (method, recording) in zip(axes, recordings.items(), strict=True):
+        for axis, mapped in zip(row, (False, True), strict=True):
+            shown = (recording.task, recording.states, recording.elements)
+            draw_paths(axis, *shown, mapped_back=mapped, headings=False)
+            goal = recording.task.goal_names[0]
+            axis.set_title(f"{label(method)}, mapped back onto {goal}" if mapped else label(method))
+        row[0].set_ylabel("y [m]")
+    names = axes[0, 0].get_legend_handles_labels()
+    figure.legend(*names, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    return figure
+
+
+def touches(recording: Recording, body: str) -> np.ndarray:
+    """Share of the time in contact that each limb has a part in, ``(goals, limbs)``; NaN without contact."""
+    model = recording.task.model
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    touched = model.body(body).id
+    limb = np.full(model.nbody, -1)
+    for number in range(model.nbody):
+        prefix = model.body(number).name.split("_")[0]
+        limb[number] = LIMBS.index(prefix) if prefix in LIMBS else -1
+    counts = np.zeros((len(recording.task.goal_names), len(LIMBS) + 1))
+    for state in recording.states:
+        for row, g in enumerate(recording.elements):
+            data.qpos[:] = state.qpos[row].numpy()
+            mujoco.mj_fwdPosition(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+            pairs = model.geom_bodyid[data.contact.geom]
+            others = pairs[(pairs == touched).any(axis=1)]
+            found = {int(n) for n in limb[others].ravel() if n >= 0}
+            counts[g, list(found)] += 1
+            counts[g, -1] += bool(found)
+    with np.errstate(invalid="ignore"):
+        return counts[:, :-1] / counts[:, -1:]
+
+
+def draw_touches(shares: dict[str, np.ndarray], goals: tuple[str, ...], body: str):
+    """A panel per method: goals by limbs."""
+    figure, axes = plt.subplots(
+        1, len(shares), figsize=(4.6 * len(shares), 2.9), layout="constrained", squeeze=False
+    )
+    for axis, (method, share) in zip(axes[0], shares.items(), strict=True):
+        axis.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+        for (row, column), value in np.ndenumerate(share):
+            shade = "white" if value > 0.6 else "black"
+            axis.text(column, row, f"{value:.0%}", ha="center", va="center", color=shade, fontsize=9)
+        axis.set_xticks(range(len(LIMBS)), LIMBS)
+        axis.set_yticks(range(len(goals)), goals)
+        axis.set_title(f"{label(method)}: limbs that touch the {body}")
+    return figure
+
+
+def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarray:
+    """Key frames of the first episode of some goals, a row per method and goal."""
+    rows, captions = [], []
+    for method, recording in recordings.items():
+        task = recording.task
+        chosen = np.linspace(0, len(recording.states) - 1, FRAMES).round().astype(int)
+        for g in goals:
+            first = recording.elements.index(g)
+            states = [recording.states[i].rows(torch.tensor([first])) for i in chosen]
+            rows.append([image[0] for image in render(task, states)])
+            name = f"{label(method)}, {task.goal_names[g]}"
+            captions.append([f"{name}, {i * task.control_timestep:.1f} s" for i in chosen])
+    return sheet(rows, captions)
+
+
+def main(arguments: Arguments) -> None:
+    torch.set_num_threads(1)
+    checkpoints = arguments.results / arguments.name / "checkpoints"
+    plots = arguments.plots / arguments.name
+    plots.mkdir(parents=True, exist_ok=True)
+    found = sorted(path.name for path in checkpoints.iterdir())
+    for name in found:
+        kept = {m: checkpoints / name / m for m in arguments.methods if (checkpoints / name / m).exists()}
+        recordings = {m: play(name, folder, arguments.episodes) for m, folder in kept.items()}
+        drawn = {}
+        if name == "anymal_push":
+            drawn["paths"] = paths(recordings)
+            many = {m: play(name, folder, arguments.touching) for m, folder in kept.items()}
+            goals = next(iter(many.values())).task.goal_names
+            drawn["touches"] = draw_touches({m: touches(r, "cube") for m, r in many.items()}, goals, "cube")
+        for kind, figure in drawn.items():
+            figure.savefig(plots / f"{name}_{kind}.png", dpi=110)
+            plt.close(figure)
+        save(plots / f"{name}_frames.png", [frames(recordings, (0, 1))])
+        print(f"drew {name}: {', '.join([*drawn, 'frames'])}")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Arguments))
