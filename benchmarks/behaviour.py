@@ -103,7 +103,7 @@ def paths(recordings: dict[str, Recording]):
 
 
 def touches(recording: Recording, body: str) -> np.ndarray:
-    """Share of the time in contact that each limb has a part in, ``(goals, limbs)``; NaN without contact."""
+    """Share of the time in contact that each limb has a part in, ``(goals, limbs)``."""
     model = recording.task.model
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     touched = model.body(body).id

@@ -3,7 +3,8 @@
     python benchmarks/compare.py --preset smoke             # everything once, tiny: under 3 minutes
     python benchmarks/compare.py --preset paper-cartpole    # CartPole in full: under an hour on two cores
     python benchmarks/compare.py --preset paper-cartpole-20 # 20 minutes more: 20 seeds where it matters
-    python benchmarks/compare.py --preset paper             # the robots as well: days on two cores
+    python benchmarks/compare.py --preset paper-push        # a robot: a night on two cores
+    python benchmarks/compare.py --preset paper             # all of them: days on two cores
     python benchmarks/compare.py --tasks anymal_push --methods ppo aug-random --seeds 5
 
 Every run is a process of its own with one thread, as many at a time as there are cores. Kill it whenever
@@ -65,6 +66,19 @@ _MORE_SEEDS = (
     Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 20),  # which is faster, and better?
     Experiment(("cartpole",), ("aug+loss-0.1+init-0.1",), 10),
 )
+# One seed of each weight tells which one is worth the others' seeds.
+_PUSH = (
+    Experiment(("anymal_push",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 5),
+    Experiment(("anymal_push",), ("loss-0.1", "loss-10"), 1),
+)
+_CLIMB = (
+    Experiment(("anymal_climb",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 3),
+    Experiment(("anymal_climb",), ("loss-0.1", "loss-10"), 1),
+)
+_REPOSE = (
+    Experiment(("trifinger_repose",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 3),
+    Experiment(("trifinger_repose",), ("loss-0.1", "loss-10"), 1),
+)
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
@@ -74,12 +88,10 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     ),
     "paper-cartpole": (_CARTPOLE,),
     "paper-cartpole-20": (_CARTPOLE, *_MORE_SEEDS),
-    "paper": (
-        _CARTPOLE,
-        *_MORE_SEEDS,
-        Experiment(("anymal_push",), MAIN, 5),
-        Experiment(("anymal_climb", "trifinger_repose"), MAIN, 3),
-    ),
+    "paper-push": _PUSH,
+    "paper-climb": _CLIMB,
+    "paper-repose": _REPOSE,
+    "paper": (_CARTPOLE, *_MORE_SEEDS, *_PUSH, *_CLIMB, *_REPOSE),
 }
 
 
@@ -87,7 +99,18 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
 class Arguments:
     """Compare methods, then draw figures and tables."""
 
-    preset: Literal["smoke", "paper-cartpole", "paper-cartpole-20", "paper"] | None = None
+    preset: (
+        Literal[
+            "smoke",
+            "paper-cartpole",
+            "paper-cartpole-20",
+            "paper-push",
+            "paper-climb",
+            "paper-repose",
+            "paper",
+        ]
+        | None
+    ) = None
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
     tasks: tuple[str, ...] = ("cartpole",)
     """Names of tasks, or module:function."""

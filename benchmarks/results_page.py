@@ -12,12 +12,14 @@ from pathlib import Path
 
 import tyro
 
-from comparison import claims
+from comparison import claims, robot_claims
 from comparison.study import Study, read
-from comparison.tables import efficiency_table, table_1
+from comparison.tables import efficiency_table, success_tables, table_1, throughput_table
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
+ROBOTS = {"paper-push": "anymal_push", "paper-climb": "anymal_climb", "paper-repose": "trifinger_repose"}
+"""Studies of robots, and their tasks; those that have no results yet are left out."""
 README_METHODS = ["ppo", "loss-0.1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {
     "training": "Training return and symmetry loss over environment steps (the paper's training figure).",
@@ -27,6 +29,18 @@ CAPTIONS = {
     "(the paper's log-probability figure).",
     "initialization": "Initial weights of several scales (the paper's initialisation figure).",
     "efficiency": "Share of seeds that have reached a return, over environment steps and over time.",
+}
+
+ROBOT_CAPTIONS = {
+    "paths": "Robot (solid) and cube (dashed) from above, equivalent goals in colours; on the right all "
+    "mapped back onto one goal (the paper's figure of observed trajectories).",
+    "touches": "Share of the time in contact with the cube that each limb has a part in, goal by goal.",
+    "frames": "Key frames of episodes from mirrored starts.",
+    "training": "Training return and symmetry loss.",
+    "success": "Success in training and the level of the curriculum.",
+    "phases": "Every seed's training return through the phases of the curriculum.",
+    "goals": "Success of every seed on every equivalent goal, with sampled actions.",
+    "efficiency": "Share of seeds that have reached a return.",
 }
 
 
@@ -42,8 +56,8 @@ class Arguments:
     """The README."""
 
 
-def page(study: Study, tuning: str) -> str:
-    """docs/results.md: claims, Table I, figures, efficiency, how it was tuned."""
+def page(study: Study, tuning: str, robots: dict[str, Study]) -> str:
+    """docs/results.md: claims, Table I, figures, efficiency, how it was tuned; then the robots."""
     about = study.about
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
@@ -102,10 +116,35 @@ Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
 {tuned}
 
 {tuning}
-## Robot tasks
+{"".join(robot_section(name, each) for name, each in robots.items())}"""
 
-So far one seed each, with augmentation: [benchmarks/results/learn](../benchmarks/results/learn/README.md).
-"""
+
+def robot_section(name: str, study: Study) -> str:
+    """What the paper claims of a robot task and what was found, with figures and costs."""
+    task, about = ROBOTS[name], study.about
+    hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
+    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
+    made = prose(f"""`{about["command"]}` at {", ".join(about["revisions"])}: {len(study.curves)} runs of
+        {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
+        `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`.""")
+    plots = f"../benchmarks/plots/{name}"
+    drawn = [path.name for path in sorted((HERE / "plots" / name).glob("*.png"))]
+    figures = "\n".join(
+        f"![{kind}]({plots}/{file})\n\n{prose(f'*{caption}*')}\n"
+        for kind, caption in ROBOT_CAPTIONS.items()
+        for file in drawn
+        if file.removesuffix(".png").endswith(kind)
+    )
+    return f"""
+## {task}
+
+{made}
+
+{robot_claims.table(study, task)}
+{success_tables(study, task)}
+{figures}
+{efficiency_table(study, task)}
+{throughput_table(study, task)}"""
 
 
 def readme_block(study: Study) -> str:
@@ -145,7 +184,8 @@ def replace_blocks(text: str, blocks: dict[str, str]) -> str:
 def main(arguments: Arguments) -> None:
     study = read(arguments.results / STUDY)
     tuning = (arguments.results / "tuning" / "README.md").read_text()
-    (arguments.docs / "results.md").write_text(page(study, tuning))
+    robots = {n: read(arguments.results / n) for n in ROBOTS if (arguments.results / n).exists()}
+    (arguments.docs / "results.md").write_text(page(study, tuning, robots))
     text = replace_blocks(arguments.readme.read_text(), {"cartpole": readme_block(study)})
     arguments.readme.write_text(text)
 

@@ -29,8 +29,8 @@ SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
 # Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
 STOP_DISTANCE = 0.12
 # The speed asked for, m/s. Near the target it falls in proportion to the distance left, to a third: a cube
-# that is pushed past its target is hard to get back. The tolerance of the velocity's reward falls with it, or
-# standing still short of the target would pay nearly as well.
+# that is pushed past its target is hard to get back. The tolerance of the velocity's reward falls with
+# it, or standing still short of the target would pay nearly as well.
 SPEED, SLOW_DISTANCE, SLOWEST = 0.6, 0.5, 0.2
 TOLERANCE = 0.8  # of the speed asked for: standing still earns a fifth
 BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
@@ -218,9 +218,9 @@ def dipole(toward: Tensor, ahead: Tensor) -> Tensor:
     """Which way a robot pushes an object to a target: along a dipole field, ``(n, 2)`` unit vectors.
 
     Straight on from behind the object, around it from beside it, and away from it where it stands between
-    object and target (Igarashi, Kamiyama and Inami, "A dipole field for object delivery by pushing on a flat
-    surface", ICRA 2010): with r the direction to the object and e the one from there to the target,
-    u = 2 (e . r) r - e.
+    object and target (Igarashi, Kamiyama and Inami, "A dipole field for object delivery by pushing on a
+    flat surface", ICRA 2010): with r the direction to the object and e the one from there to the
+    target, u = 2 (e . r) r - e.
 
     Args:
         toward: direction from the robot to the object, ``(n, 2)``, unit vectors.

@@ -257,8 +257,11 @@ class BatchedEnv(EnvBase):
         )
 
     def metrics(self) -> dict[str, float]:
-        """How training goes: what the task measures (success, level), simulations that diverged so far, and
-        seconds of physics since the last call."""
+        """How training goes: what the task measures, and how the simulations fare.
+
+        Success, level and the like are the task's; ``diverged`` counts simulations from the start,
+        ``physics_seconds`` is the time spent in them since the last call.
+        """
         seconds, self.simulation.seconds = self.simulation.seconds, 0.0
         own = {"diverged": float(self.num_diverged), "physics_seconds": seconds}
         return own | self.task.metrics()

@@ -27,8 +27,8 @@ class Simulation:
     The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``time`` (n,), ``ctrl`` (n, nu),
     ``mocap_pos`` (n, nmocap, 3) and ``mocap_quat`` (n, nmocap, 4) are live float64 views of the
     simulations' memory in MuJoCo's units (m, rad, s, N): they change with every step, so copy what
-    you keep. ``seconds`` is the time spent stepping so far. Start episodes with :meth:`write`, not through the views: it also clears what the
-    solver remembers.
+    you keep. Start episodes with :meth:`write`, not through the views: it also clears what the
+    solver remembers. ``seconds`` is the time spent stepping.
 
     Args:
         model: the compiled model; shared by all simulations.

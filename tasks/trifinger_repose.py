@@ -114,8 +114,8 @@ class TrifingerRepose(Task):
             raise ValueError(f"expected a difficulty of 1, 2, 3 or 4, got {difficulty!r}")
         if yaw is not None and not (difficulty == 1 and 0 < yaw <= math.pi):
             raise ValueError(
-                f"expected a yaw in (0, pi] rad at difficulty 1, got {yaw} at {difficulty}; difficulty 4 has "
-                "orientations of its own"
+                f"expected a yaw in (0, pi] rad at difficulty 1, got {yaw} at {difficulty}; difficulty 4 "
+                "has orientations of its own"
             )
         if not 0 < radius <= ARENA or weak_finger not in (None, 0, 1, 2):
             raise ValueError(

@@ -9,7 +9,8 @@ import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 
-from comparison import claims, methods, tables
+import plot
+from comparison import claims, methods, robot_claims, tables
 from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
 from comparison.run import Run, environment, read_curve, task_setting
@@ -294,3 +295,99 @@ def test_an_unknown_task_says_what_is_expected():
         with pytest.raises(ValueError, match="expected a task of"):
             environment(task)
     assert task_setting("cartpole") is SETTINGS["cartpole"]
+
+
+GOALS = ("front", "back")
+
+
+def make_robot_study(figures, losses, starts, seeds=5):
+    """A study of a robot task.
+
+    Args:
+        figures: by method, success of both goals; returns are ten times, turning follows the spread.
+        losses: by method, symmetry loss.
+        starts: by method, the point at which training gets there.
+        seeds: of each method.
+    """
+    noise = np.random.default_rng(0)
+    rows, curves = [], {}
+    for method, success in figures.items():
+        for seed in range(seeds):
+            for goal, share in zip(GOALS, success, strict=True):
+                share = share + noise.normal() * 0.001
+                turning = 3 * abs(success[0] - success[1]) + noise.normal() * 0.001
+                row = {"task": "robot", "method": method, "seed": seed, "outcome": "finished"}
+                row |= {"what": "task", "goal": goal, "return": 12 * share, "task_return": 10 * share}
+                for actions in ("sampled", "deterministic"):
+                    scale = 1.0 if actions == "sampled" else 0.5
+                    row_ = row | {"actions": actions, "success": scale * share, "turning": turning}
+                    rows.append(row_)
+            level = np.full(30, 1.0) + noise.normal(size=30) * 0.01
+            level[starts[method] :] += 10 * np.mean(success)
+            steps = np.arange(1, 31)
+            curves["robot", method, seed] = {
+                "frames": steps * 1e5,
+                "iteration": steps * 2.0,
+                "seconds": steps * 20.0,
+                "collect_seconds": np.full(30, 6.0),
+                "physics_seconds": np.full(30, 5.0),
+                "return": level,
+                "success": level / 12,
+                "level": level,
+                "phase": np.repeat([0.0, 1.0, 2.0], 10),
+                "mirror_loss": np.full(30, losses[method]),
+            }
+    about = {"command": "c", "revisions": ["r"], "machine": "m", "workers": 2}
+    return Study(about | {"methods": {"robot": dict.fromkeys(figures)}}, rows, curves)
+
+
+def robot_world(right):
+    """Where the paper's claims hold, and where they do not."""
+    good, bad = (0.9, 0.9), (0.9, 0.2)
+    both = (0.9, 0.9) if right else (0.99, 0.99)
+    names = ("ppo", "loss-1", "aug", "aug-random", "aug+loss-1")
+    success = [bad, bad, good, good, both] if right else [good, good, bad, (0.2, 0.1), both]
+    early, late = (3, 15) if right else (15, 3)
+    starts = [late, late, early, early, early]
+    losses = [10.0, 1.0, 0.01, 0.01, 0.01] if right else [0.01, 0.1, 10.0, 10.0, 10.0]
+    return make_robot_study(*(dict(zip(names, each, strict=True)) for each in (success, losses, starts)))
+
+
+@pytest.mark.parametrize("right", [True, False])
+def test_verdicts_on_robots_turn_with_the_data(right):
+    lines = robot_claims.table(robot_world(right), "robot").splitlines()[2:]
+    assert len(lines) == len(robot_claims.CLAIMS) == 7
+    for line in lines:
+        assert line.endswith("**confirmed** |" if right else "**different** |"), line
+
+
+def test_claims_about_robots_need_their_methods():
+    study = robot_world(True)
+    study.about["methods"]["robot"] = {"ppo": None, "aug": None}
+    assert len(robot_claims.table(study, "robot").splitlines()) == 2 + 5
+
+
+def test_success_table_by_hand():
+    study = make_robot_study({"ppo": (0.5, 0.75)}, {"ppo": 2.0}, {"ppo": 5}, seeds=1)
+    row = tables.success_table(study, "robot", None, "sampled", "task").splitlines()[2]
+    cells = [cell.split(" (")[0] for cell in row.strip("| ").split(" | ")]
+    assert cells[:2] == ["PPO", "1"] and cells[9] == "2"
+    numbers = [float(cell) for cell in [*cells[2:9], cells[10]]]
+    by_hand = [62.5, 50, 25, 6.25, 2.5, 7.5, 3.0, 0.75]
+    np.testing.assert_allclose(numbers, by_hand, rtol=0.02)
+    text = tables.success_tables(study, "robot")
+    assert text.count("| PPO |") == 2 and "Mean actions:" in text
+
+
+def test_throughput_table_splits_the_time():
+    study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=1)
+    assert "| PPO | 5,000 | 50% | 10% | 40% |" in tables.throughput_table(study, "robot")
+
+
+def test_robots_are_drawn_with_success_and_phases(tmp_path):
+    study = robot_world(True)
+    for figure in (plot.success(study), plot.phases(study), plot.goals(study)):
+        figure.savefig(tmp_path / "figure.png")
+    assert plot.phases(study).axes[0].get_title() == "robot: PPO"
+    cartpole = world(PAPER_IS_RIGHT, seeds=2)
+    assert plot.success(cartpole) is None and plot.phases(cartpole) is None

@@ -59,8 +59,9 @@ def sampled(what: Callable, task: str, column: str = "return") -> Callable:
 
 
 def weights(study: Study, task: str) -> list[str]:
-    """The methods with nothing but a mirror loss."""
-    return [m for m in study.methods(task) if parts(m)[0] == "ppo" and parts(m)[1] and parts(m)[2] == 1.0]
+    """The methods with nothing but a mirror loss, and as many seeds as plain PPO."""
+    losses = [m for m in study.methods(task) if parts(m)[0] == "ppo" and parts(m)[1]]
+    return [m for m in losses if len(study.seeds(task, m)) >= len(study.seeds(task, "ppo"))]
 
 
 def with_loss(study: Study, task: str) -> str | None:

@@ -189,7 +189,7 @@ def read_curve(folder: Path) -> list[dict[str, float]]:
 
 
 def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
-    """Return, return of the task's own terms, success rate and behaviour of every goal; None if undefined."""
+    """Return, return of the task's own terms, success and behaviour of every goal; None if undefined."""
     return [
         {
             "goal": goal,

@@ -3,8 +3,8 @@
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
 * `study.json`: command, commit, versions, machine; hyper-parameters per task and method; what failed.
-* `checkpoints/TASK/METHOD`: the policy of the seed with the highest evaluated return, where there is success
-  to look at, for `examples/watch.py` and `behaviour.py`.
+* `checkpoints/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
+  succeed or fail; `examples/watch.py` and `behaviour.py` read it.
 """
 
 import csv

@@ -57,10 +57,11 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
             text += f"{title[0].upper()}{title[1:]}:\n\n"
             text += success_table(study, task, methods, actions, what) + "\n"
     return text + (
-        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the lowest\n"
-        "success of a goal (mean over seeds). *spread*: the largest difference between two goals of a seed, in\n"
-        "success (percentage points) or return. *task return*: without terms of gait and effort. *turning*:\n"
-        "yaw travelled in an episode. *symmetry loss*: as in the paper, on the last iteration's states.\n"
+        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the\n"
+        "lowest success of a goal (mean over seeds). *spread*: the largest difference between two goals\n"
+        "of a seed, in success (percentage points) or return. *task return*: without terms of gait and\n"
+        "effort. *turning*: yaw travelled in an episode. *symmetry loss*: as in the paper, on the states\n"
+        "of the last iteration.\n"
     )
 
 
