@@ -77,17 +77,15 @@ _ANYMAL = PPOConfig(
 # Training in steps of 0.01 s is 1.4 times as fast.
 _FAST = {"physics_timestep": 0.01}
 
-# Pushing wants a steady hand: twice the batch, half the policy change, less noise, and a learning rate that
-# settles. (With _ANYMAL and earlier rewards, success rose to 0.6 and fell again as targets moved away.)
+# Pushing wants a steady hand: less noise, and a learning rate that settles. (With 1024 simulations, half as
+# many updates per step, it took twice the steps; a KL of 0.012 was slower, 0.03 fell over at once.)
 _PUSH = dataclasses.replace(
     _ANYMAL,
-    iterations=380,
-    num_envs=1024,
-    entropy_coeff=0.001,
-    desired_kl=0.012,
+    iterations=490,
+    entropy_coeff=0.0005,
+    initial_std=0.15,
     adapt_every="iteration",
 )
-_PUSH_ON = dataclasses.replace(_PUSH, iterations=108, entropy_coeff=0.0)
 _CLIMB_ON = dataclasses.replace(
     _ANYMAL, iterations=220, entropy_coeff=0.0, desired_kl=0.01, max_learning_rate=1e-3
 )

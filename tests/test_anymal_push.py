@@ -12,12 +12,14 @@ from tasks.anymal_push import (
     BASE_HEIGHT,
     CUBE,
     FALL_PENALTY,
+    GAIT_WEIGHTS,
     SPEED,
     STOP_DISTANCE,
     TASK_WEIGHTS,
     TOLERANCE,
     AnymalPush,
     dipole,
+    facing,
 )
 from tasks.environment import BatchedEnv
 from tasks.state import concatenate
@@ -110,6 +112,20 @@ def test_the_robot_is_asked_round_the_cube_along_a_dipole_field():
     torch.testing.assert_close(
         -place / place.norm(dim=-1, keepdim=True), ahead[:1].expand(40, 2), rtol=0, atol=0.3
     )
+
+
+def test_front_and_back_face_the_cube_alike_and_the_sides_do_not():
+    turn = torch.eye(3).double().expand(5, 3, 3).clone()
+    toward = directions(torch.tensor([0.0, math.pi, math.pi / 2, math.pi / 4, 1.0]).double())
+    expected = torch.tensor([1.0, 1.0, 0.0, 0.5, math.cos(1.0) ** 2]).double()
+    torch.testing.assert_close(facing(turn, toward), expected)
+    pitched = turn @ torch.tensor([[0.8, 0, 0.6], [0, 1.0, 0], [-0.6, 0, 0.8]]).double()
+    torch.testing.assert_close(facing(pitched, toward), expected)
+    task, state = standing()
+    weight = 0.02 * GAIT_WEIGHTS["facing"]
+    assert 0 < float(task.reward_terms(state, zeros(state))["facing"]) < weight
+    state.mocap_pos[:, 0, :2] = state.qpos[:, 19:21]  # nothing is left to push
+    assert float(task.reward_terms(state, zeros(state))["facing"]) == pytest.approx(weight)
 
 
 def test_progress_pays_for_the_distance_covered_and_takes_it_back():
