@@ -25,6 +25,9 @@ CUBE = 0.3  # half its edge, m
 CUBE_DISTANCE, CUBE_TURN = (1.0, 1.3), 0.3
 # How far behind the cube the target is, m: 0.3 + 0.15 level U(0.5, 1), at most 1.35 at the last level.
 NEAREST_TARGET, TARGET_STEP, LAST_LEVEL = 0.3, 0.15, 7
+# What observed positions are multiplied by. What is left to push is observed itself, and much enlarged: the
+# robot has to tell 10 cm, where it stops, from 20 cm, which is not enough.
+CUBE_SCALE, GAP_SCALE = 2.0, 5.0
 SUCCESS_DISTANCE = 0.2  # of cube and target at the end of an episode, m
 # Motion is rewarded until the cube is this close, m: nearer than needed, so that stopping there succeeds.
 STOP_DISTANCE = 0.12
@@ -56,7 +59,8 @@ EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.00
 class AnymalPush(Anymal):
     """Push a cube of 0.6 m and 8 kg to a target 0.3 to 1.35 m away.
 
-    Group: Klein four. Observation: 45 proprioceptive numbers, cube and target position in the base frame.
+    Group: Klein four. Observation: 45 proprioceptive numbers, position of the cube and from there to the
+    target in the base frame.
     An episode succeeds if the cube ends within 0.2 m of the target.
 
     Args:
@@ -85,12 +89,12 @@ class AnymalPush(Anymal):
         self.averages = Averages("success", "level")
 
     def layout(self) -> tuple[Entry, ...]:
-        """Proprioception, then where cube and target are."""
+        """Proprioception, then where the cube is, and where it has to go."""
         position = polar(self.robot.group)
         return (
             *self.proprioception(),
-            Entry("cube position", position, "m", "base", "polar vector"),
-            Entry("target position", position, "m", "base", "polar vector"),
+            Entry("cube position", position, "m", "base", "polar vector", CUBE_SCALE),
+            Entry("from cube to target", position, "m", "base", "polar vector", GAP_SCALE),
         )
 
     def variables(self) -> dict[str, Representation]:
@@ -164,13 +168,14 @@ class AnymalPush(Anymal):
         return state.shared("distance", lambda: self._gap(state).norm(dim=-1))
 
     def observe(self, state: State) -> Tensor:
-        """Proprioception, cube and target in the base frame."""
+        """Proprioception, cube, and from there to the target, in the base frame."""
         assert state.mocap_pos is not None
         observation = torch.empty(len(state), 51)
         self.observe_robot(state, observation)
         turn, base = rotation(state), state.qpos[:, 0:3]
-        observation[:, 45:48] = into_base(turn, state.qpos[:, 19:22] - base)
-        observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - base)
+        cube = state.qpos[:, 19:22]
+        observation[:, 45:48] = into_base(turn, cube - base) * CUBE_SCALE
+        observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - cube) * GAP_SCALE
         return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:

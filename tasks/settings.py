@@ -81,10 +81,15 @@ _FAST = {"physics_timestep": 0.01}
 # many updates per step, it took twice the steps; a KL of 0.012 was slower, 0.03 fell over at once.)
 _PUSH = dataclasses.replace(
     _ANYMAL,
-    iterations=490,
+    iterations=400,  # 4.9 M steps
     entropy_coeff=0.0005,
     initial_std=0.15,
     adapt_every="iteration",
+)
+# Policies lean on their noise, which starts steps: mean actions come to a stop before the target. With less
+# of it for the last 0.7 M steps they lean less, and do as well in steps of 0.005 s as in those of training.
+_PUSH_ON = dataclasses.replace(
+    _PUSH, iterations=60, desired_kl=0.015, entropy_coeff=0.0, initial_std=0.08, max_std=0.08
 )
 _CLIMB_ON = dataclasses.replace(
     _ANYMAL, iterations=220, entropy_coeff=0.0, desired_kl=0.01, max_learning_rate=1e-3
@@ -123,9 +128,7 @@ _CARTPOLE = PPOConfig(
 
 SETTINGS: dict[str, Setting] = {
     "cartpole": Setting(_CARTPOLE),
-    # 9.3 M steps, then 2.7 M in steps of 0.005 s and without a bonus for noise. With 12.0 M of the first
-    # kind as many sampled episodes succeeded, but 59 % instead of 64 % without noise (one seed).
-    "anymal_push": Setting(_PUSH, _FAST, then=(Setting(_PUSH_ON),)),
+    "anymal_push": Setting(_PUSH, _FAST, then=(Setting(_PUSH_ON, _FAST),)),
     "anymal_climb": Setting(  # 21.4 M steps
         dataclasses.replace(_ANYMAL, iterations=1740),
         _FAST,

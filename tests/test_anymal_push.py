@@ -53,8 +53,8 @@ def test_the_canonical_goal_is_in_front_on_the_left_of_the_robot():
     yaw = 2 * torch.atan2(state.qpos[:, 6], state.qpos[:, 3])
     assert yaw.min() < -3.0 and yaw.max() > 3.0
     observation = task.observe(state).double()
-    torch.testing.assert_close(observation[:, 45:48], cube, rtol=0, atol=1e-6)
-    torch.testing.assert_close(observation[:, 48:51], target, rtol=0, atol=1e-6)
+    torch.testing.assert_close(observation[:, 45:48], 2 * cube, rtol=0, atol=1e-6)
+    torch.testing.assert_close(observation[:, 48:51], 5 * (target - cube), rtol=0, atol=2e-6)
 
 
 def test_every_goal_has_its_direction():
