@@ -130,7 +130,8 @@ def throughput_table(study: Study, task: str) -> str:
         shares = np.median(np.concatenate(parts, axis=1), axis=1)
         rate = 1 / seconds_per_step(study, task, method)
         rows.append([label(method), f"{rate:,.0f}", *(f"{share:.0%}" for share in shares)])
-    note = "One process with one thread per run, as many at a time as cores: two cores do twice as much.\n"
+    note = "Medians of one process with one thread, measured while every other core was busy with a run of its\n"
+    note += "own: the machine as a whole makes as many times these steps as it has cores.\n"
     return markdown(rows) + "\n" + note
 
 
