@@ -19,7 +19,7 @@ export MPLBACKEND ?= Agg
 .DEFAULT_GOAL := help
 
 help:
-	@echo "make quickstart   train PPO with and without symmetry on CartPole, draw the learning curves"
+	@echo "make quickstart   train PPO with and without symmetry on CartPole; watch ANYmal push a cube"
 	@echo "make test         run all tests and doctests"
 	@echo "make check        lint, formatting, types"
 	@echo "make build        wheel and sdist in dist/; the wheel is smoke-tested in a clean environment"
@@ -31,8 +31,12 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python $(PIP_INSTALL) --editable '.[dev]'
 	@touch $@
 
+# A robot policy is replayed at the end; the film needs OpenGL, the picture of its paths does not.
+PUSH := anymal_push --checkpoint benchmarks/results/paper-push/checkpoints/anymal_push/aug --stochastic
 quickstart: $(INSTALLED)
 	$(BIN)/python examples/quickstart.py
+	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png
+	-$(BIN)/python examples/watch.py $(PUSH) --out runs/quickstart/push.gif
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest $(PYTEST_ARGS)

@@ -14,7 +14,7 @@ import tyro
 
 from comparison import claims, robot_claims
 from comparison.study import Study, read
-from comparison.tables import efficiency_table, success_tables, table_1, throughput_table
+from comparison.tables import efficiency_table, success_table, success_tables, table_1, throughput_table
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
@@ -162,6 +162,18 @@ def readme_block(study: Study) -> str:
     return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"
 
 
+def readme_robot_block(study: Study) -> str:
+    """What the README says of ANYmal-Push."""
+    task = "anymal_push"
+    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
+    seeds = " to ".join(map(str, sorted({len(study.seeds(task, m)) for m in study.methods(task)})))
+    table = success_table(study, task, columns=(0, 2, 3, 4, 7, 8, 10))
+    text = prose("""Interquartile means over seeds with 95 % bootstrap intervals, 500 episodes per goal.
+        *spread*: the largest difference between two equivalent goals of a seed, in success (percentage
+        points) or return; *turning*: yaw travelled in an episode.""")
+    return f"After {steps:.1f} million steps, {seeds} seeds per method:\n\n{table}\n{text}\n"
+
+
 def prose(text: str) -> str:
     """A paragraph in lines of the repository's width."""
     return textwrap.fill(" ".join(text.split()), 108, break_long_words=False, break_on_hyphens=False)
@@ -186,7 +198,10 @@ def main(arguments: Arguments) -> None:
     tuning = (arguments.results / "tuning" / "README.md").read_text()
     robots = {n: read(arguments.results / n) for n in ROBOTS if (arguments.results / n).exists()}
     (arguments.docs / "results.md").write_text(page(study, tuning, robots))
-    text = replace_blocks(arguments.readme.read_text(), {"cartpole": readme_block(study)})
+    blocks = {"cartpole": readme_block(study)}
+    if "paper-push" in robots:
+        blocks["anymal_push"] = readme_robot_block(robots["paper-push"])
+    text = replace_blocks(arguments.readme.read_text(), blocks)
     arguments.readme.write_text(text)
 
 

@@ -1,5 +1,7 @@
 """The numbers of a comparison as Markdown: Table I of the paper, and how fast each method gets there."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from comparison.intervals import estimate, iqm
@@ -65,8 +67,24 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
     )
 
 
-def success_table(study: Study, task: str, methods: list[str] | None, actions: str, what: str) -> str:
-    """Success, task return and return of every method, each with its spread over the goals."""
+def success_table(
+    study: Study,
+    task: str,
+    methods: list[str] | None = None,
+    actions: str = "sampled",
+    what: str = "task",
+    columns: Sequence[int] | None = None,
+) -> str:
+    """Success, task return and return of every method, each with its spread over the goals.
+
+    Args:
+        study: the results.
+        task: one of its tasks.
+        methods: rows; all by default.
+        actions: `sampled` or `deterministic`.
+        what: one of the task's evaluations.
+        columns: numbers of the columns to show; all by default.
+    """
     head = ["method", "seeds", "success [%]", "worst goal", "spread", "task return", "spread", "return"]
     head += ["spread", "symmetry loss"]
     shown = methods or study.methods(task)
@@ -88,7 +106,7 @@ def success_table(study: Study, task: str, methods: list[str] | None, actions: s
         row += [symmetry_loss(study, task, method)]
         row += [estimate(turns[method].mean(axis=1)).format(2)] * turned
         rows.append(row)
-    return markdown(rows)
+    return markdown(rows if columns is None else [[row[i] for i in columns] for row in rows])
 
 
 def seeds_of(study: Study, task: str, method: str) -> str:
@@ -130,8 +148,10 @@ def throughput_table(study: Study, task: str) -> str:
         shares = np.median(np.concatenate(parts, axis=1), axis=1)
         rate = 1 / seconds_per_step(study, task, method)
         rows.append([label(method), f"{rate:,.0f}", *(f"{share:.0%}" for share in shares)])
-    note = "Medians of one process with one thread, measured while every other core was busy with a run of its\n"
-    note += "own: the machine as a whole makes as many times these steps as it has cores.\n"
+    note = (
+        "Medians of one process with one thread, measured while every other core was busy with another run:\n"
+        "two cores make twice as many steps in all.\n"
+    )
     return markdown(rows) + "\n" + note
 
 
