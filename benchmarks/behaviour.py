@@ -1,11 +1,11 @@
 """Pictures of what policies do on equivalent goals, from the checkpoints that a comparison keeps.
 
-    python benchmarks/behaviour.py paper-robots
+    python benchmarks/behaviour.py paper-push
 
 * `TASK_paths`: robot and object from above, as run and mapped back onto one goal (the paper's figure of
   ANYmal-Push): what is symmetric leaves a single bundle of paths there.
 * `TASK_touches`: which limbs touch the object, goal by goal.
-* `TASK_frames`: key frames, one row per method and goal.
+* `TASK_frames`: key frames of the first two goals, a row per method and goal.
 
 Episodes are paired: every goal starts from the image of the same states. Drawn for the best seed of each
 method, with sampled actions.
@@ -26,10 +26,10 @@ import torch
 import tyro
 from torchrl.envs.utils import ExplorationType
 
-import tasks
 from comparison.methods import label
 from tasks.anymal import LEGS
-from tasks.base import Task
+from tasks.base import Task, create
+from tasks.environment import BatchedEnv
 from tasks.rendering import draw_paths, record, render, save, sheet
 from tasks.state import State, concatenate
 from torchrl_sym.recipes import load_actor
@@ -44,7 +44,7 @@ LIMBS = (*LEGS, "base")
 class Arguments:
     """Draw what the policies of a comparison do."""
 
-    name: tyro.conf.Positional[str] = "paper-robots"
+    name: tyro.conf.Positional[str] = "paper-push"
     """What the results are called."""
     methods: tuple[str, ...] = ("ppo", "aug")
     """Whose policies."""
@@ -52,6 +52,8 @@ class Arguments:
     """Per goal, in the figures of paths."""
     touching: int = 50
     """Episodes per goal, in the figures of limbs."""
+    seconds: float | None = None
+    """Length of the episodes; the task's own when left out."""
     results: Path = HERE / "results"
     """Where results are, in a folder of their name."""
     plots: Path = HERE / "plots"
@@ -73,12 +75,11 @@ class Recording:
     elements: list[int]
 
 
-def play(task_name: str, checkpoint: Path, episodes: int) -> Recording:
+def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
     """Episodes of all goals with sampled actions, from the images of the same starts."""
-    task = tasks.make_env(task_name, num_envs=1, seed=0).task
     order = task.symmetry.group.order
     elements = [g for g in range(order) for _ in range(episodes)]
-    env = tasks.make_env(task_name, num_envs=len(elements), num_threads=1, seed=0)
+    env = BatchedEnv(task, len(elements), num_threads=1, seed=0)
     canonical = task.sample_goal_state(episodes, torch.Generator().manual_seed(SEED))
     start = concatenate([task.transform_state(canonical, g) for g in range(order)])
     torch.manual_seed(SEED)
@@ -112,8 +113,13 @@ def touches(recording: Recording, body: str) -> np.ndarray:
         prefix = model.body(number).name.split("_")[0]
         limb[number] = LIMBS.index(prefix) if prefix in LIMBS else -1
     counts = np.zeros((len(recording.task.goal_names), len(LIMBS) + 1))
+    fallen = torch.zeros(len(recording.elements), dtype=torch.bool)
     for state in recording.states:
+        over = recording.task.terminated(state)
+        fallen = fallen if over is None else fallen | over
         for row, g in enumerate(recording.elements):
+            if fallen[row]:
+                continue
             data.qpos[:] = state.qpos[row].numpy()
             mujoco.mj_fwdPosition(model, data)  # pyright: ignore[reportAttributeAccessIssue]
             pairs = model.geom_bodyid[data.contact.geom]
@@ -134,7 +140,8 @@ def draw_touches(shares: dict[str, np.ndarray], goals: tuple[str, ...], body: st
         axis.imshow(share, cmap="Blues", vmin=0, vmax=1, aspect="auto")
         for (row, column), value in np.ndenumerate(share):
             shade = "white" if value > 0.6 else "black"
-            axis.text(column, row, f"{value:.0%}", ha="center", va="center", color=shade, fontsize=9)
+            text = f"{value:.0%}" if np.isfinite(value) else "-"
+            axis.text(column, row, text, ha="center", va="center", color=shade, fontsize=9)
         axis.set_xticks(range(len(LIMBS)), LIMBS)
         axis.set_yticks(range(len(goals)), goals)
         axis.set_title(f"{label(method)}: limbs that touch the {body}")
@@ -159,18 +166,24 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
     checkpoints = arguments.results / arguments.name / "checkpoints"
+    if not checkpoints.is_dir():
+        raise SystemExit(f"expected policies in {checkpoints}, found none; run compare.py on a robot task")
     plots = arguments.plots / arguments.name
     plots.mkdir(parents=True, exist_ok=True)
     found = sorted(path.name for path in checkpoints.iterdir())
     for name in found:
+        task = create(name, episode_seconds=arguments.seconds)
         kept = {m: checkpoints / name / m for m in arguments.methods if (checkpoints / name / m).exists()}
-        recordings = {m: play(name, folder, arguments.episodes) for m, folder in kept.items()}
+        if not kept:
+            print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
+            continue
+        recordings = {m: play(task, folder, arguments.episodes) for m, folder in kept.items()}
         drawn = {}
         if name == "anymal_push":
             drawn["paths"] = paths(recordings)
-            many = {m: play(name, folder, arguments.touching) for m, folder in kept.items()}
-            goals = next(iter(many.values())).task.goal_names
-            drawn["touches"] = draw_touches({m: touches(r, "cube") for m, r in many.items()}, goals, "cube")
+            many = {m: play(task, folder, arguments.touching) for m, folder in kept.items()}
+            shares = {m: touches(recording, "cube") for m, recording in many.items()}
+            drawn["touches"] = draw_touches(shares, task.goal_names, "cube")
         for kind, figure in drawn.items():
             figure.savefig(plots / f"{name}_{kind}.png", dpi=110)
             plt.close(figure)

@@ -66,19 +66,15 @@ _MORE_SEEDS = (
     Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 20),  # which is faster, and better?
     Experiment(("cartpole",), ("aug+loss-0.1+init-0.1",), 10),
 )
-# One seed of each weight tells which one is worth the others' seeds.
-_PUSH = (
-    Experiment(("anymal_push",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 5),
-    Experiment(("anymal_push",), ("loss-0.1", "loss-10"), 1),
-)
-_CLIMB = (
-    Experiment(("anymal_climb",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 3),
-    Experiment(("anymal_climb",), ("loss-0.1", "loss-10"), 1),
-)
-_REPOSE = (
-    Experiment(("trifinger_repose",), ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1"), 3),
-    Experiment(("trifinger_repose",), ("loss-0.1", "loss-10"), 1),
-)
+
+
+def _robot(task: str, seeds: int) -> tuple[Experiment, ...]:
+    """One weight of the mirror loss with all seeds, two others with one, for orientation."""
+    methods = ("ppo", "aug", "aug-random", "loss-1", "aug+loss-1")
+    return Experiment((task,), methods, seeds), Experiment((task,), ("loss-0.1", "loss-10"), 1)
+
+
+_PUSH, _CLIMB, _REPOSE = _robot("anymal_push", 5), _robot("anymal_climb", 3), _robot("trifinger_repose", 3)
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
@@ -99,18 +95,7 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
 class Arguments:
     """Compare methods, then draw figures and tables."""
 
-    preset: (
-        Literal[
-            "smoke",
-            "paper-cartpole",
-            "paper-cartpole-20",
-            "paper-push",
-            "paper-climb",
-            "paper-repose",
-            "paper",
-        ]
-        | None
-    ) = None
+    preset: Literal[tuple(PRESETS)] | None = None  # type: ignore[valid-type]
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
     tasks: tuple[str, ...] = ("cartpole",)
     """Names of tasks, or module:function."""

@@ -21,8 +21,9 @@ from matplotlib.axes import Axes
 
 from comparison.intervals import band, iqm
 from comparison.methods import label, parts
-from comparison.study import Study, read
-from comparison.tables import has_success, seconds_per_step, steps_to, tables, threshold
+from comparison.robot_tables import has_success, tables
+from comparison.study import Study, has_curriculum, read
+from comparison.tables import measured, seconds_per_step, steps_to, threshold
 
 HERE = Path(__file__).parent
 COLORS = {
@@ -185,7 +186,7 @@ def share_limits(axes: Iterable[Axes]) -> None:
 
 def success(study: Study):
     """Success and level of the curriculum while training."""
-    shown = [task for task in study.tasks if has_success(study, task)]
+    shown = [task for task in study.tasks if any(map(has_curriculum, study.curves_of_task(task)))]
     if not shown:
         return None
     figure, panels = pairs(len(shown))
@@ -201,13 +202,17 @@ def success(study: Study):
 
 def phases(study: Study):
     """Every seed's training return, with a mark where its curriculum enters another phase."""
-    shown = [task for task in study.tasks if "phase" in next(iter(study.curves_of_task(task)), {})]
+    shown = [
+        (task, method)
+        for task in study.tasks
+        for method in compared(study.methods(task))
+        if any(np.isfinite(c.get("phase", np.nan)).any() for c in study.curves_of(task, method).values())
+    ]
     if not shown:
         return None
-    methods = compared(study.methods(shown[0]))
-    figure, axes = grid(1, len(methods), 3.4)
-    for axis, method in zip(axes[0], methods, strict=True):
-        for own in study.curves_of(shown[0], method).values():
+    figure, axes = grid(1, len(shown), 3.4)
+    for axis, (task, method) in zip(axes[0], shown, strict=True):
+        for own in study.curves_of(task, method).values():
             steps = own["frames"] / 1e6
             axis.plot(steps, own["return"], color=color(method), linewidth=0.9, alpha=0.8)
             entered = np.flatnonzero(np.diff(own["phase"]) > 0) + 1
@@ -215,7 +220,7 @@ def phases(study: Study):
                 axis.plot(steps[at], own["return"][at], "o", color="black", markersize=3)
                 name = "ABC"[int(own["phase"][at])]
                 axis.annotate(name, (steps[at], own["return"][at]), (0, 5), textcoords="offset points")
-        axis.set(title=f"{shown[0]}: {label(method)}", xlabel=STEPS)
+        axis.set(title=f"{task}: {label(method)}", xlabel=STEPS)
     axes[0, 0].set_ylabel("training return, per seed")
     share_limits(axes[0])
     return figure
@@ -241,8 +246,8 @@ def goals(study: Study):
             range(len(methods)), [label(m) for m in methods], rotation=40, ha="right", fontsize=7.5
         )
         what = ", ".join(f"{m} {name}" for m, name in zip("▸◂▴▾◆■", legend_goals, strict=False))
-        measured = "success rate" if succeeds else "mean return"
-        axis.set(title=f"{task}: {what}", ylabel=f"{measured} of a goal, per seed")
+        figure_of = "success rate" if succeeds else "mean return"
+        axis.set(title=f"{task}: {what}", ylabel=f"{figure_of} of a goal, per seed")
         axis.grid(axis="x", visible=False)
     return figure
 
@@ -254,7 +259,7 @@ def efficiency(study: Study):
         goal = threshold(study, task)
         for method in compared(study.methods(task)):
             reached = np.sort(steps_to(study, task, method, goal))
-            steps = study.curve(task, method, "return")[0]
+            steps = study.curve(task, method, "progress")[0]
             if not len(steps):
                 continue
             share = np.arange(1, len(reached) + 1) / len(reached)
@@ -266,7 +271,7 @@ def efficiency(study: Study):
             top.step(x, y, **style)
             bottom.step(x * 1e6 * seconds_per_step(study, task, method), y, **style)
         top.set(
-            title=f"{task}: training return ≥ {goal:.2f}",
+            title=f"{task}: {measured(study, task)} ≥ {goal:.2f}",
             xlabel=STEPS,
             ylabel="share of seeds",
         )

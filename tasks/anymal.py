@@ -4,7 +4,8 @@ The robot is observed in its own base frame, so that only the part of a symmetry
 seen by the policy. Quantities of the base come from the floating joint, feet from closed-form kinematics;
 nothing is read from derived fields of the simulator, which lag by one physics step.
 
-No term of a reward prefers a direction, a leg or a sign: all are norms, or even functions of the state.
+No term of a reward tells a direction from its mirror image, or one leg from another: all are norms, or even
+functions of the state.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ class Anymal(Task):
     Args:
         episode_seconds: length of an episode, s; None for the task's own.
         physics_timestep: 0.005 s; 0.01 s simulates 1.6 times as fast, good enough for most of a training,
-            but its contacts are softer: finish in 0.005 s.
+            but its contacts are softer: finish in 0.005 s, or with little noise, and check there.
         friction: range of a factor on all sliding friction, drawn per episode; None keeps the model's.
         added_mass: range of the mass added to the base, kg, drawn per episode; None adds none.
         payload: mass in kg fixed on top of the base at ``payload_position``, for studies of asymmetry.

@@ -1,8 +1,8 @@
 """ANYmal-Push: walk to a cube and push it to a target, wherever around the robot the two are.
 
-Cube and target lie on one ray from the robot. Pushing forward, backward and to either side are then equally
-hard, and a policy without symmetry typically learns to turn and to use two of its legs only. The target
-moves farther away as pushes succeed.
+Cube and target lie on one ray from the robot. Pushing with the front and with the back is then equally
+hard, and so is pushing to the left and to the right; a policy without symmetry typically learns to turn
+and to use two of its legs only. The target moves farther away as pushes succeed.
 """
 
 from __future__ import annotations
@@ -40,9 +40,10 @@ BASE_HEIGHT, LOWEST = 0.48, 0.22  # asked for, and counted as fallen, m
 FALL_PENALTY = 5.0
 # Weights of the reward's terms. The first group is the task; the others ask for a gait that lasts.
 # Holding the cube at the target must pay much more than walking on with it: while it did not, policies
-# pushed ever faster past the target. Crouching must cost: with a quarter of the weights of height and tilt,
-# robots leaned on the cube and came to a stop half way to far targets. Facing pays alike with the front
-# and with the back: without it, robots set out sideways and pushed the cube off its line while turning.
+# pushed ever faster past the target. Crouching must cost: with a quarter of the weight of height and a
+# third of that of tilt, robots leaned on the cube and came to a stop half way to far targets. Facing pays
+# alike with the front and with the back: without it, robots set out sideways and pushed the cube off its
+# line while turning.
 TASK_WEIGHTS = {"velocity": 4.0, "progress": 10.0, "tracking": 5.0}
 GAIT_WEIGHTS = {
     "facing": 2.0,

@@ -23,7 +23,7 @@ from comparison.run import Run
 from tasks.settings import SETTINGS
 
 ROOT = Path(__file__).parents[1]
-FIGURES = {"training.png", "log_prob.png", "initialization.png", "goals.png", "efficiency.png"}
+FIGURES = {"training", "log_prob", "initialization", "goals", "efficiency", "success", "phases"}
 TINY = ["--config", "num_envs=8", "horizon=25", "epochs=1", "minibatches=1", "checkpoint_interval=2"]
 TIMING = ("seconds", "collect_seconds", "physics_seconds")
 
@@ -86,8 +86,8 @@ def test_smoke_draws_every_figure_of_every_task(tmp_path):
     compare(tmp_path, "--preset", "smoke")
     assert time.monotonic() - started < 300  # 180 s on two cores that have nothing else to do
     drawn = {path.name: path.stat().st_size for path in (tmp_path / "plots" / "smoke").iterdir()}
-    assert set(drawn) == FIGURES | {"tables.md"}
-    assert all(drawn[name] > 10_000 for name in FIGURES)
+    assert set(drawn) == {f"{name}.png" for name in FIGURES} | {"tables.md"}
+    assert all(drawn[f"{name}.png"] > 10_000 for name in FIGURES)
     about = json.loads((tmp_path / "results" / "smoke" / "study.json").read_text())
     assert set(about["methods"]) == {"cartpole", "anymal_push", "anymal_climb", "trifinger_repose"}
     assert {"aug-naive", "aug-naive-raw", "aug+init-4", "loss-10"} <= set(about["methods"]["cartpole"])

@@ -10,7 +10,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 
 import plot
-from comparison import claims, methods, robot_claims, tables
+import results_page
+from comparison import claims, methods, robot_claims, robot_tables, tables, verdicts
 from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
 from comparison.run import Run, environment, read_curve, task_setting
@@ -79,7 +80,8 @@ def test_interquartile_mean_by_hand():
     low, high = band(np.array([[1.0, 5.0], [1.0, 7.0]]))
     assert (low[0], high[0]) == (1.0, 1.0)
     assert (low[1], high[1]) == (5.0, 7.0)
-    assert estimate(np.array([3.0])) == Estimate(3.0, 3.0, 3.0)
+    assert estimate(np.array([3.0])) == Estimate(3.0, -math.inf, math.inf)
+    assert estimate(np.array([3.0])).format() == "3.000"
 
 
 def test_intervals_are_those_of_repeated_experiments():
@@ -150,17 +152,17 @@ def test_curves_of_different_lengths_are_aligned_by_steps():
 
 
 def test_verdicts_follow_the_interval():
-    assert claims.verdict(Estimate(1.0, 0.1, 2.0)) == "confirmed"
-    assert claims.verdict(Estimate(1.0, -0.1, 2.0)) == "not confirmed"
-    assert claims.verdict(Estimate(-1.0, -2.0, -0.1)) == "different"
-    assert claims.no_gain(Estimate(1.0, 0.1, 2.0), 0.5) == "different"
-    assert claims.no_gain(Estimate(1.0, -0.1, 2.0), 0.5) == "not confirmed"
-    assert claims.no_gain(Estimate(0.1, -0.1, 0.3), 0.5) == "confirmed"
-    assert claims.more((10, 10), (2, 10)) == "confirmed"
-    assert claims.more((2, 10), (10, 10)) == "different"
-    assert claims.more((10, 10), (9, 10)) == "not confirmed"
-    assert claims.joined(return_="a", speed="a") == "a"
-    assert claims.joined(than_PPO="a", speed="b") == "than PPO: a, speed: b"
+    assert verdicts.verdict(Estimate(1.0, 0.1, 2.0)) == "confirmed"
+    assert verdicts.verdict(Estimate(1.0, -0.1, 2.0)) == "not confirmed"
+    assert verdicts.verdict(Estimate(-1.0, -2.0, -0.1)) == "different"
+    assert verdicts.no_gain(Estimate(1.0, 0.1, 2.0), 0.5) == "different"
+    assert verdicts.no_gain(Estimate(1.0, -0.1, 2.0), 0.5) == "not confirmed"
+    assert verdicts.no_gain(Estimate(0.1, -0.1, 0.3), 0.5) == "confirmed"
+    assert verdicts.more((10, 10), (2, 10)) == "confirmed"
+    assert verdicts.more((2, 10), (10, 10)) == "different"
+    assert verdicts.more((10, 10), (9, 10)) == "not confirmed"
+    assert verdicts.joined(return_="a", speed="a") == "a"
+    assert verdicts.joined(than_PPO="a", speed="b") == "than PPO: a, speed: b"
 
 
 # Per method: evaluated returns of both sides, the point at which training gets there, symmetry loss.
@@ -334,7 +336,7 @@ def make_robot_study(figures, losses, starts, seeds=5):
                 "return": level,
                 "success": level / 12,
                 "level": level,
-                "phase": np.repeat([0.0, 1.0, 2.0], 10),
+                "phase": np.minimum(steps - 1.0, 2.0),
                 "mirror_loss": np.full(30, losses[method]),
             }
     about = {"command": "c", "revisions": ["r"], "machine": "m", "workers": 2}
@@ -344,9 +346,8 @@ def make_robot_study(figures, losses, starts, seeds=5):
 def robot_world(right):
     """Where the paper's claims hold, and where they do not."""
     good, bad = (0.9, 0.9), (0.9, 0.2)
-    both = (0.9, 0.9) if right else (0.99, 0.99)
     names = ("ppo", "loss-1", "aug", "aug-random", "aug+loss-1")
-    success = [bad, bad, good, good, both] if right else [good, good, bad, (0.2, 0.1), both]
+    success = [bad, bad, good, good, good] if right else [good, good, bad, (0.2, 0.1), good]
     early, late = (3, 15) if right else (15, 3)
     starts = [late, late, early, early, early]
     losses = [10.0, 1.0, 0.01, 0.01, 0.01] if right else [0.01, 0.1, 10.0, 10.0, 10.0]
@@ -369,25 +370,61 @@ def test_claims_about_robots_need_their_methods():
 
 def test_success_table_by_hand():
     study = make_robot_study({"ppo": (0.5, 0.75)}, {"ppo": 2.0}, {"ppo": 5}, seeds=1)
-    row = tables.success_table(study, "robot", None, "sampled", "task").splitlines()[2]
-    cells = [cell.split(" (")[0] for cell in row.strip("| ").split(" | ")]
+    row = robot_tables.success_table(study, "robot").splitlines()[2]
+    assert "(" not in row, "a single seed has no interval"
+    cells = row.strip("| ").split(" | ")
     assert cells[:2] == ["PPO", "1"] and cells[9] == "2"
     numbers = [float(cell) for cell in [*cells[2:9], cells[10]]]
     by_hand = [62.5, 50, 25, 6.25, 2.5, 7.5, 3.0, 0.75]
     np.testing.assert_allclose(numbers, by_hand, rtol=0.02)
-    text = tables.success_tables(study, "robot")
+    short = robot_tables.success_table(study, "robot", columns=("method", "spread [%]")).splitlines()
+    assert short[0] == "| method | spread [%] |" and short[2] == f"| PPO | {cells[4]} |"
+    text = robot_tables.success_tables(study, "robot")
     assert text.count("| PPO |") == 2 and "Mean actions:" in text
 
 
 def test_throughput_table_splits_the_time():
     study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=1)
-    assert "| PPO | 5,000 | 50% | 10% | 40% |" in tables.throughput_table(study, "robot")
+    assert "| PPO | 5,000 | 50% | 10% | 40% |" in robot_tables.throughput_table(study, "robot")
 
 
-def test_robots_are_drawn_with_success_and_phases(tmp_path):
-    study = robot_world(True)
-    for figure in (plot.success(study), plot.phases(study), plot.goals(study)):
-        figure.savefig(tmp_path / "figure.png")
-    assert plot.phases(study).axes[0].get_title() == "robot: PPO"
-    cartpole = world(PAPER_IS_RIGHT, seeds=2)
+def test_progress_in_a_curriculum_is_the_level_that_is_mastered_in_the_last_phase():
+    study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=1)
+    curve = study.curves["robot", "ppo", 0]
+    mastered = curve["level"] * curve["success"]
+    values = study.curve("robot", "ppo", "progress")[1][0]
+    assert (values[:2] == 0).all(), "phases A and B"
+    np.testing.assert_allclose(values[2:], mastered[2:])
+    del curve["phase"]
+    np.testing.assert_allclose(study.curve("robot", "ppo", "progress")[1][0], mastered)
+    del curve["level"]
+    assert (study.curve("robot", "ppo", "progress")[1][0] == curve["return"]).all()
+    assert np.isnan(study.curve("robot", "ppo", "level")[1]).all()
+    assert tables.measured(study, "robot") == "training return"
+
+
+def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkeypatch):
+    study, cartpole = robot_world(True), world(PAPER_IS_RIGHT, seeds=2)
+    for column in ("phase", "level", "success", "physics_seconds"):  # one table of curves for all tasks
+        for curve in cartpole.curves.values():
+            curve[column] = np.full(30, math.nan)
     assert plot.success(cartpole) is None and plot.phases(cartpole) is None
+    about = study.about | {"methods": cartpole.about["methods"] | study.about["methods"], "episodes": [500]}
+    del study.curves["robot", "loss-1", 0]  # its rows stay: it diverged at once
+    both = Study(about, cartpole.runs + study.runs, cartpole.curves | study.curves)
+    assert plot.phases(both).axes[0].get_title() == "robot: PPO"
+    for figure in (plot.success(both), plot.goals(both), plot.efficiency(both)):
+        figure.savefig(tmp_path / "figure.png")
+    text = robot_tables.tables(both)
+    assert text.count("Mean actions:") == 1 and "nan" not in text
+    monkeypatch.setitem(results_page.ROBOTS, "paper-robot", "robot")
+    page = results_page.robot_section("paper-robot", both)
+    assert page.count("**confirmed**") == 7 and "too narrow" not in page
+
+
+def test_a_method_without_any_evaluated_seed_is_named():
+    study = robot_world(True)
+    lost = Study(study.about, [r for r in study.runs if r["method"] != "ppo"], study.curves)
+    table = robot_claims.table(lost, "robot")
+    assert table.count("no seed of PPO was evaluated") == 6
+    assert "| PPO | 0 | - |" in robot_tables.success_table(lost, "robot")

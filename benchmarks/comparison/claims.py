@@ -1,22 +1,18 @@
-"""Every claim of the paper that CartPole can decide, judged by a rule on the stored results.
-
-Two methods are compared by the difference of interquartile means over seeds and its 95 % bootstrap
-interval: *confirmed* if the interval lies on the claimed side of zero, *different* if it lies on the other
-side, *not confirmed* if it contains zero. That something gains nothing is confirmed if the whole interval
-is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %.
-"""
+"""Every claim of the paper that CartPole can decide, judged by a rule on the stored results."""
 
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy import stats
 
-from comparison.intervals import Estimate, difference, iqm
+from comparison import verdicts
+from comparison.intervals import difference, iqm
 from comparison.methods import label
 from comparison.study import Study
-from comparison.tables import markdown, seconds_per_step, steps_to, steps_to_own, threshold, variation
+from comparison.tables import markdown, seconds_per_step, steps_to, steps_to_own, threshold
+from comparison.verdicts import Judgement, joined, more, no_gain, pair, verdict
 
 TASK = "cartpole"
 # A goal that is solved by swinging the long way round costs about 2; half of it tells the two ways apart.
@@ -24,8 +20,13 @@ SWING = 1.0
 NO_DIFFERENCE = {"return": 0.1, "steps": 0.3}  # margins, in return and in million steps
 WEIGHTS = ("loss-0.1", "loss-1", "loss-10")
 
-Judgement = tuple[str, str]  # evidence, verdict
 CLAIMS: list["Claim"] = []
+
+
+returns, variations, symmetry_loss, steps = (
+    partial(what, task=TASK)
+    for what in (verdicts.returns, verdicts.variations, verdicts.symmetry_loss, verdicts.steps)
+)
 
 
 @dataclass(frozen=True)
@@ -47,78 +48,20 @@ def claim(text: str, place: str) -> Callable[[Callable[[Study], Judgement]], Cal
     return register
 
 
-def returns(study: Study, method: str, task: str = TASK, **which: str) -> np.ndarray:
-    """Evaluated return of every seed, or what else `Study.goal_returns` is asked for."""
-    return study.goal_returns(task, method, **which)[1].mean(axis=1)
-
-
-def variations(study: Study, method: str, task: str = TASK, **which: str) -> np.ndarray:
-    """Difference between the goals, of every seed."""
-    return variation(study.goal_returns(task, method, **which)[1])
-
-
-def symmetry_loss(study: Study, method: str, task: str = TASK) -> np.ndarray:
-    """Decimal logarithm of the last symmetry loss of every seed."""
-    return np.log10(np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12))
-
-
-def steps(study: Study, method: str, task: str = TASK) -> np.ndarray:
-    """Million steps to the threshold; seeds that never reach it count as the whole run."""
-    reached = steps_to(study, task, method, threshold(study, task))
-    return np.minimum(reached, study.curve(task, method, "return")[0][-1])
-
-
 def own_steps(study: Study, method: str) -> np.ndarray:
     """Million steps to nine tenths of a seed's own last return."""
     return steps_to_own(study, TASK, method)
 
 
-def reached(study: Study, method: str, task: str = TASK) -> tuple[int, int]:
+def reached(study: Study, method: str) -> tuple[int, int]:
     """How many seeds reach the threshold, and how many there are."""
-    found = np.isfinite(steps_to(study, task, method, threshold(study, task)))
+    found = np.isfinite(steps_to(study, TASK, method, threshold(study, TASK)))
     return int(found.sum()), len(found)
 
 
 def best_weight(study: Study) -> str:
     """The weight of the mirror loss with the highest return."""
     return max(WEIGHTS, key=lambda method: iqm(returns(study, method)))
-
-
-def verdict(claimed_positive: Estimate) -> str:
-    """The rule for a difference that the paper says is positive."""
-    if claimed_positive.low > 0:
-        return "confirmed"
-    return "different" if claimed_positive.high < 0 else "not confirmed"
-
-
-def no_gain(gain: Estimate, margin: float) -> str:
-    """The rule for a gain that the paper says is none."""
-    if gain.low > 0:
-        return "different"
-    return "confirmed" if gain.high < margin else "not confirmed"
-
-
-def more(a: tuple[int, int], b: tuple[int, int]) -> str:
-    """The rule for counts, of a total each, of which the paper says the first is larger."""
-    table = [[a[0], a[1] - a[0]], [b[0], b[1] - b[0]]]
-    if stats.fisher_exact(table, alternative="greater").pvalue < 0.05:
-        return "confirmed"
-    return "different" if stats.fisher_exact(table, alternative="less").pvalue < 0.05 else "not confirmed"
-
-
-def pair(study: Study, what: Callable, a: str, b: str, digits: int = 3) -> tuple[str, Estimate]:
-    """Both interquartile means, and the difference of the first minus the second, as text and number."""
-    x, y = what(study, a), what(study, b)
-    gap = difference(x, y)
-    values = f"{label(a)} {iqm(x):.{digits}f}, {label(b)} {iqm(y):.{digits}f}"
-    return f"{values}, difference {gap.format(digits)}", gap
-
-
-def joined(**verdicts: str) -> str:
-    """One verdict if all agree, or else each with its name."""
-    if len(set(verdicts.values())) == 1:
-        return next(iter(verdicts.values()))
-    return ", ".join(f"{name.replace('_', ' ')}: {outcome}" for name, outcome in verdicts.items())
 
 
 @claim("Augmentation yields the highest return.", "Sec. IV-C, Fig. 4, Table I")

@@ -6,6 +6,7 @@ difference, is bootstrapped over seeds (95 %, percentiles), with a fixed generat
 drawn alike every time. (Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS.)
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,9 @@ class Estimate:
     high: float
 
     def format(self, digits: int = 3) -> str:
-        """For a table."""
+        """For a table; without interval if there is none."""
+        if not math.isfinite(self.low):
+            return f"{self.value:.{digits}f}"
         return f"{self.value:.{digits}f} ({self.low:.{digits}f} to {self.high:.{digits}f})"
 
 
@@ -34,8 +37,11 @@ def iqm(values: np.ndarray, axis: int = 0) -> np.ndarray:
 
 def estimate(values: np.ndarray) -> Estimate:
     """Interquartile mean over seeds ``(seeds,)`` with its interval; no interval for a single seed."""
+    value = float(iqm(values))
+    if len(values) < 2:
+        return Estimate(value, -math.inf, math.inf)
     low, high = band(np.asarray(values, dtype=float)[:, None])
-    return Estimate(float(iqm(values)), float(low[0]), float(high[0]))
+    return Estimate(value, float(low[0]), float(high[0]))
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -52,7 +58,7 @@ def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Interquartile mean of ``a`` minus that of ``b``, ``(seeds,)`` each, resampled independently."""
     value = float(iqm(a) - iqm(b))
     if min(len(a), len(b)) < 2:
-        return Estimate(value, float("-inf"), float("inf"))
+        return Estimate(value, -math.inf, math.inf)
     result = stats.bootstrap(
         (np.asarray(a, dtype=float), np.asarray(b, dtype=float)),
         lambda x, y, axis=-1: iqm(x, axis) - iqm(y, axis),

@@ -1,7 +1,7 @@
-"""The paper's claims that every robot task can decide, judged by the rules of `claims.py`.
+"""The paper's claims that every robot task can decide, judged by the rules of `verdicts.py`.
 
 Returns, successes and turning are those of sampled actions, as in training; mean actions are in the tables.
-A claim whose methods have not been run, or whose figures a task does not have, is left out.
+A claim whose methods are not in the study, or whose figures a task does not have, is left out.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,11 @@ from functools import partial
 
 import numpy as np
 
-from comparison.claims import (
+from comparison.intervals import difference, iqm
+from comparison.methods import label, parts
+from comparison.study import Study
+from comparison.tables import markdown, measured, seconds_per_step
+from comparison.verdicts import (
     Judgement,
     joined,
     no_gain,
@@ -21,10 +25,6 @@ from comparison.claims import (
     variations,
     verdict,
 )
-from comparison.intervals import difference, iqm
-from comparison.methods import parts
-from comparison.study import Study
-from comparison.tables import markdown, seconds_per_step
 
 FIGURES = {"return": "return", "task_return": "task return", "success": "success"}
 NO_DIFFERENCE = 0.05  # of the return of augmentation: what a mirror loss beside it may add
@@ -33,135 +33,157 @@ CLAIMS: list["RobotClaim"] = []
 
 
 @dataclass(frozen=True)
+class Results:
+    """One evaluation of one task of a study."""
+
+    study: Study
+    task: str
+    what: str
+
+    def sampled(self, of: Callable, column: str = "return") -> Callable:
+        """A figure of sampled actions, to be handed to `pair`."""
+        return partial(of, task=self.task, what=self.what, column=column, actions="sampled")
+
+    def seeds(self, method: str, column: str = "return") -> int:
+        """How many seeds of a method were evaluated."""
+        which = {"what": self.what, "column": column, "actions": "sampled"}
+        values = self.study.goal_returns(self.task, method, **which)[1]
+        return int(np.isfinite(values).all(axis=1).sum())
+
+    def losses(self) -> list[str]:
+        """The methods with nothing but a mirror loss, and at least two seeds."""
+        found = [m for m in self.study.methods(self.task) if parts(m)[0] == "ppo" and parts(m)[1]]
+        return [m for m in found if self.seeds(m) > 1]
+
+    def with_loss(self) -> str | None:
+        """The method with augmentation and a mirror loss, if there is one."""
+        found = [m for m in self.study.methods(self.task) if parts(m)[0] == "aug" and parts(m)[1]]
+        return next((m for m in found if self.seeds(m) > 1), None)
+
+
+@dataclass(frozen=True)
 class RobotClaim:
     """What the paper says, where, how it is judged, and what has to be there for it."""
 
     text: str
     place: str
-    judge: Callable[[Study, str], Judgement]
+    judge: Callable[[Results], Judgement | None]
     methods: tuple[str, ...]
-    figure: str = "return"
+    figure: str
 
 
 def claim(text: str, place: str, *methods: str, figure: str = "return"):
     """Register a judge where it is defined."""
 
-    def register(judge: Callable[[Study, str], Judgement]) -> Callable[[Study, str], Judgement]:
+    def register(judge: Callable[[Results], Judgement | None]):
         CLAIMS.append(RobotClaim(text, place, judge, methods, figure))
         return judge
 
     return register
 
 
-def sampled(what: Callable, task: str, column: str = "return") -> Callable:
-    """A figure of sampled actions, to be handed to `pair`."""
-    return partial(what, task=task, column=column, actions="sampled")
-
-
-def weights(study: Study, task: str) -> list[str]:
-    """The methods with nothing but a mirror loss, and as many seeds as plain PPO."""
-    losses = [m for m in study.methods(task) if parts(m)[0] == "ppo" and parts(m)[1]]
-    return [m for m in losses if len(study.seeds(task, m)) >= len(study.seeds(task, "ppo"))]
-
-
-def with_loss(study: Study, task: str) -> str | None:
-    """The method with augmentation and a mirror loss, if there is one."""
-    found = [m for m in study.methods(task) if parts(m)[0] == "aug" and parts(m)[1]]
-    return found[0] if found else None
-
-
-def figures(study: Study, task: str) -> dict[str, str]:
+def figures(results: Results) -> dict[str, str]:
     """Those of return, task return and success that the task has."""
-    found = {c: study.goal_returns(task, "aug", c, "sampled")[1] for c in FIGURES}
-    return {c: FIGURES[c] for c, values in found.items() if np.isfinite(values).any()}
+    return {column: name for column, name in FIGURES.items() if results.seeds("aug", column)}
 
 
 @claim("Augmentation yields the highest return.", "Table I", "ppo", "aug")
-def _return(study: Study, task: str) -> Judgement:
+def _return(results: Results) -> Judgement:
     texts, outcomes = [], {}
-    for column, name in figures(study, task).items():
-        text, gap = pair(study, sampled(returns, task, column), "aug", "ppo")
+    for column, name in figures(results).items():
+        text, gap = pair(results.study, results.sampled(returns, column), "aug", "ppo")
         texts.append(f"{name}: {text}")
         outcomes[column] = verdict(gap)
-    losses = weights(study, task)
-    if losses:
-        best = max(losses, key=lambda m: iqm(sampled(returns, task)(study, m)))
-        text, gap = pair(study, sampled(returns, task), "aug", best)
-        texts.append(f"return, best weight: {text}")
-        outcomes["than mirror loss"] = verdict(gap)
+    for loss in results.losses():
+        text, gap = pair(results.study, results.sampled(returns), "aug", loss)
+        texts.append(f"return: {text}")
+        outcomes[f"than {loss}"] = verdict(gap)
     return "; ".join(texts), joined(**outcomes)
 
 
 @claim("Augmentation makes the variation between equivalent goals much lower.", "Table I", "ppo", "aug")
-def _variation(study: Study, task: str) -> Judgement:
+def _variation(results: Results) -> Judgement:
     texts, outcomes = [], {}
-    for column, name in figures(study, task).items():
-        text, gap = pair(study, sampled(variations, task, column), "ppo", "aug")
-        plain, copies = (sampled(variations, task, column)(study, m).mean() for m in ("ppo", "aug"))
+    for column, name in figures(results).items():
+        of = results.sampled(variations, column)
+        text, gap = pair(results.study, of, "ppo", "aug")
+        plain, copies = (of(results.study, method).mean() for method in ("ppo", "aug"))
         texts.append(f"{name}: {text}, ratio of means {plain / max(copies, 1e-12):.1f}")
         outcomes[column] = verdict(gap)
     return "; ".join(texts), joined(**outcomes)
 
 
 @claim("Augmentation keeps the symmetry loss low.", "Sec. IV-C", "ppo", "aug")
-def _low_loss(study: Study, task: str) -> Judgement:
-    plain, copies = (symmetry_loss(study, m, task) for m in ("ppo", "aug"))
+def _low_loss(results: Results) -> Judgement:
+    plain, copies = (symmetry_loss(results.study, m, task=results.task) for m in ("ppo", "aug"))
     gap = difference(plain, copies)
     text = f"PPO {10 ** iqm(plain):.2g}, PPO + aug. {10 ** iqm(copies):.2g}; orders of magnitude "
     return text + gap.format(1), verdict(gap)
 
 
 @claim("Augmentation converges fastest.", "Sec. IV-C, Fig. 4", "ppo", "aug")
-def _speed(study: Study, task: str) -> Judgement:
-    what = partial(steps, task=task)
-    text, gap = pair(study, what, "ppo", "aug", 2)
-    outcomes = {"than PPO": verdict(gap)}
-    losses = weights(study, task)
-    if losses:
-        fastest = min(losses, key=lambda m: iqm(what(study, m)))
-        rival, ahead = pair(study, what, fastest, "aug", 2)
-        text += f"; fastest weight: {rival}"
-        outcomes["than mirror loss"] = verdict(ahead)
-    return f"million steps to the threshold: {text}", joined(**outcomes)
+def _speed(results: Results) -> Judgement:
+    of = partial(steps, task=results.task)
+    texts, outcomes = [], {}
+    for slower in ("ppo", *results.losses()):
+        text, gap = pair(results.study, of, slower, "aug", 2)
+        texts.append(text)
+        outcomes[f"than {slower}"] = verdict(gap)
+    what = measured(results.study, results.task)
+    return f"million steps to nine tenths of the {what}: {'; '.join(texts)}", joined(**outcomes)
 
 
 @claim("Without augmentation, the robot turns round to use its favourite limbs.", "Sec. IV-F", "ppo", "aug",
        figure="turning")  # fmt: skip
-def _turning(study: Study, task: str) -> Judgement:
-    text, gap = pair(study, sampled(returns, task, "turning"), "ppo", "aug", 2)
-    return f"yaw travelled in an episode, rad: {text}", verdict(gap)
+def _turning(results: Results) -> Judgement:
+    text, gap = pair(results.study, results.sampled(returns, "turning"), "ppo", "aug", 2)
+    return f"yaw travelled in an episode, to and fro, gait included, rad: {text}", verdict(gap)
 
 
 @claim("Adding a mirror loss to augmentation does not help.", "Sec. IV-C", "aug")
-def _both(study: Study, task: str) -> Judgement | None:
-    both = with_loss(study, task)
+def _both(results: Results) -> Judgement | None:
+    both = results.with_loss()
     if both is None:
         return None
-    text, gain = pair(study, sampled(returns, task), both, "aug")
-    margin = NO_DIFFERENCE * abs(float(iqm(sampled(returns, task)(study, "aug"))))
+    text, gain = pair(results.study, results.sampled(returns), both, "aug")
+    margin = _margin(results)
     return f"return: {text}; margin {margin:.2f}", no_gain(gain, margin)
 
 
 @claim("One random element per sample is as good as all of them.", "not in the paper", "aug", "aug-random",
        "ppo")  # fmt: skip
-def _random(study: Study, task: str) -> Judgement:
-    text, loss = pair(study, sampled(returns, task), "aug", "aug-random")
-    cost = [seconds_per_step(study, task, m) for m in ("ppo", "aug", "aug-random")]
-    margin = NO_DIFFERENCE * abs(float(iqm(sampled(returns, task)(study, "aug"))))
+def _random(results: Results) -> Judgement:
+    text, loss = pair(results.study, results.sampled(returns), "aug", "aug-random")
+    cost = [seconds_per_step(results.study, results.task, m) for m in ("ppo", "aug", "aug-random")]
+    margin = _margin(results)
     text += f"; time per step over PPO's: {cost[2] / cost[0]:.2f}, all {cost[1] / cost[0]:.2f}"
     return f"return: {text}; margin {margin:.2f}", no_gain(loss, margin)
 
 
-def table(study: Study, task: str) -> str:
-    """The claims with evidence and verdict, as Markdown."""
+def _margin(results: Results) -> float:
+    return NO_DIFFERENCE * abs(float(iqm(results.sampled(returns)(results.study, "aug"))))
+
+
+def table(study: Study, task: str, what: str | None = None) -> str:
+    """The claims with evidence and verdict, as Markdown.
+
+    Args:
+        study: the results.
+        task: one of its tasks.
+        what: one of the task's evaluations; the first by default.
+    """
     rows = [["claim", "place", "evidence here", "verdict"], ["---"] * 4]
-    methods = study.methods(task)
+    results = Results(study, task, what or study.evaluations(task)[0])
     for each in CLAIMS:
-        if not set(each.methods) <= set(methods):
+        if not set(each.methods) <= set(study.methods(task)):
             continue
-        if not np.isfinite(study.goal_returns(task, "aug", each.figure, "sampled")[1]).any():
+        lost = [label(m) for m in each.methods if not results.seeds(m)]
+        if lost:
+            rows.append([each.text, each.place, f"no seed of {', '.join(lost)} was evaluated", "-"])
             continue
-        judgement = each.judge(study, task)
+        if not results.seeds("aug", each.figure):
+            continue
+        judgement = each.judge(results)
         if judgement is not None:
             rows.append([each.text, each.place, judgement[0], f"**{judgement[1]}**"])
     return markdown(rows)

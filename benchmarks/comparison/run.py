@@ -192,11 +192,11 @@ def goal_rows(outcome: Evaluation) -> list[dict[str, Any]]:
     """Return, return of the task's own terms, success and behaviour of every goal; None if undefined."""
     return [
         {
+            **outcome.goal_behaviours[goal],
             "goal": goal,
             "return": value,
             "task_return": outcome.task_means.get(goal),
             "success": outcome.goal_successes.get(goal),
-            **outcome.goal_behaviours[goal],
         }
         for goal, value in outcome.goal_means.items()
     ]

@@ -23,11 +23,12 @@ from comparison.run import Run, read_curve, stage_folders, write_json
 from torchrl_sym.recipes import export_actor
 
 RUN = ("task", "method", "seed")
-EVALUATION = ("what", "actions", "goal", "return", "task_return", "success", "turning")
+EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")  # then the behaviour
 CURVE = (
     *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
     *("std", "learning_rate", "kl", "success", "level", "phase", "collect_seconds", "physics_seconds"),
 )
+LAST_PHASE = 2.0  # of a curriculum in three phases
 POINTS = 105  # rows per curve that are kept, at most
 
 
@@ -74,7 +75,9 @@ def write(
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
         export_actor(stage_folders(run.folder)[-1], folder / "checkpoints" / run.task / run.method)
-    _write_table(folder / "runs.csv", (*RUN, "outcome", "frames", "seconds", *EVALUATION), evaluated)
+    first = (*RUN, "outcome", "frames", "seconds", *EVALUATION)
+    behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
+    _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
     about |= {"failed": [str(run) for run in failed], "methods": methods}
@@ -131,7 +134,9 @@ class Study:
     def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
         """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
 
-        At every point, a seed's value is its latest. So one that diverged keeps its last, and is not
+        The column `progress` is the training return, or where there is a curriculum, in which returns fall
+        as tasks get harder, the level times the success rate (in its last phase, zero before). At every
+        point, a seed's value is its latest. So one that diverged keeps its last, and is not
         dropped from the average; one that diverged before it had a value is.
         """
         columns = list(self.curves_of(task, method).values())
@@ -141,7 +146,8 @@ class Study:
         values = []
         for c in columns:
             latest = np.searchsorted(c["frames"], steps, side="right") - 1
-            values.append(np.where(latest < 0, np.nan, c[column][latest]))
+            own = progress(c) if column == "progress" else c.get(column, np.full(len(c["frames"]), np.nan))
+            values.append(np.where(latest < 0, np.nan, own[latest]))
         values = np.array(values)
         return steps / 1e6, values[np.isfinite(values[:, -1])]
 
@@ -189,6 +195,19 @@ class Study:
 
     def _rows(self, task: str, method: str) -> list[dict[str, Any]]:
         return [row for row in self.runs if (row["task"], row["method"]) == (task, method)]
+
+
+def has_curriculum(curve: dict[str, np.ndarray]) -> bool:
+    """Whether a run has levels and successes."""
+    return all(np.isfinite(curve.get(name, np.nan)).any() for name in ("level", "success"))
+
+
+def progress(curve: dict[str, np.ndarray]) -> np.ndarray:
+    """How far a run has come, at every logged iteration; see `Study.curve`."""
+    if not has_curriculum(curve):
+        return curve["return"]
+    last = np.nan_to_num(curve["phase"], nan=LAST_PHASE) == LAST_PHASE if "phase" in curve else 1.0
+    return curve["level"] * curve["success"] * last
 
 
 def read(folder: Path) -> Study:

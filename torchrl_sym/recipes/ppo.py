@@ -77,9 +77,9 @@ def train(
     Yields:
         iteration, frames, return (mean of the latest finished episodes), mirror_loss, log_prob and
         log_prob_copies (mean log pi_k of samples and of their copies), kl, every loss and diagnostic of
-        the updates, learning_rate, std, seconds, frames_per_second, collect_seconds (of this iteration's
-        data; the rest of its time is learning); and what the environment's own ``metrics()`` returns, if
-        it has any (success rate, level of the curriculum).
+        the updates, learning_rate, std, seconds, frames_per_second, collect_seconds (for this
+        iteration's data; updates and logging take the rest of its time); and what the environment's own
+        ``metrics()`` returns, if it has any (success rate, level of the curriculum).
 
     Raises:
         ValueError: the folder holds a run with another configuration.

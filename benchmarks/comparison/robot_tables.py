@@ -1,0 +1,136 @@
+"""Tables of tasks that succeed or fail: Table I with successes, and what the time of training went into."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from comparison.intervals import estimate
+from comparison.methods import label
+from comparison.study import Study
+from comparison.tables import (
+    efficiency_table,
+    markdown,
+    seconds_per_step,
+    seeds_of,
+    symmetry_loss,
+    table_1,
+    variation,
+)
+
+ACTIONS = {"sampled": "sampled actions, as in training", "deterministic": "mean actions"}
+
+
+def tables(study: Study) -> str:
+    """All tables of a study, of robots or not."""
+    text = f"Made by `{study.about['command']}` at {', '.join(study.about['revisions'])}, "
+    text += f"{study.about['machine']}, {study.about['workers']} runs at a time.\n"
+    for task in study.tasks:
+        body = success_tables(study, task) if has_success(study, task) else table_1(study, task)
+        text += f"\n## {task}\n\n{body}\n{efficiency_table(study, task)}"
+        if has_split(study, task):
+            text += f"\n{throughput_table(study, task)}"
+    return text
+
+
+def success_tables(study: Study, task: str, methods: list[str] | None = None) -> str:
+    """A table per evaluation and kind of actions."""
+    text = ""
+    for what in study.evaluations(task):
+        for actions, name in ACTIONS.items():
+            title = name if what == "task" else f"{what}, {name}"
+            text += f"{title[0].upper()}{title[1:]}:\n\n"
+            text += success_table(study, task, methods, actions, what) + "\n"
+    return text + (
+        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the\n"
+        "lowest success of a goal (mean over seeds). *spread*: the largest difference between two goals\n"
+        "of a seed; the noise of sampled actions is not paired, so that about 3 points of success are\n"
+        "chance. *task return*: without terms of gait and effort. *turning*: yaw travelled in an episode.\n"
+        "*symmetry loss*: as in the paper, on the states of the last iteration.\n"
+    )
+
+
+def success_table(
+    study: Study,
+    task: str,
+    methods: list[str] | None = None,
+    actions: str = "sampled",
+    what: str | None = None,
+    columns: Sequence[str] | None = None,
+) -> str:
+    """Success, task return and return of every method, each with its spread over the goals.
+
+    Args:
+        study: the results.
+        task: one of its tasks.
+        methods: rows; all by default.
+        actions: `sampled` or `deterministic`.
+        what: one of the task's evaluations; the first by default.
+        columns: names of the columns to show; all by default.
+    """
+    rows = [_row(study, task, method, actions, what) for method in methods or study.methods(task)]
+    known = dict.fromkeys(name for row in rows for name in row)
+    shown = [name for name in known if columns is None or name in columns]
+    head = [shown, ["---", *["---:"] * (len(shown) - 1)]]
+    return markdown(head + [[row.get(name, "-") for name in shown] for row in rows])
+
+
+def _row(study: Study, task: str, method: str, actions: str, what: str | None) -> dict[str, str]:
+    row = {"method": label(method), "seeds": seeds_of(study, task, method)}
+    figures = {
+        column: study.goal_returns(task, method, column, actions, what)[1]
+        for column in ("success", "task_return", "return", "turning")
+    }
+    if not len(figures["success"]):  # it diverged before its first checkpoint
+        return row
+    success = 100 * figures["success"]
+    row["success [%]"] = estimate(success.mean(axis=1)).format(1)
+    row["worst goal [%]"] = f"{success.mean(axis=0).min():.1f}"
+    row["spread [%]"] = estimate(variation(success)).format(1)
+    for column, name in (("task_return", "task return"), ("return", "return")):
+        row[name] = estimate(figures[column].mean(axis=1)).format(2)
+        row[f"spread of {name}"] = estimate(variation(figures[column])).format(2)
+    row["symmetry loss"] = symmetry_loss(study, task, method)
+    if np.isfinite(figures["turning"]).any():
+        row["turning [rad]"] = estimate(figures["turning"].mean(axis=1)).format(2)
+    return row
+
+
+def has_success(study: Study, task: str) -> bool:
+    """Whether episodes of a task succeed or fail."""
+    return any(row["task"] == task and row.get("success") is not None for row in study.runs)
+
+
+def has_split(study: Study, task: str) -> bool:
+    """Whether it was logged what the time of a task's training went into."""
+    return any(np.isfinite(c.get("physics_seconds", np.nan)).any() for c in study.curves_of_task(task))
+
+
+def throughput_table(study: Study, task: str) -> str:
+    """Environment steps per second, learning included, and what the time goes into."""
+    rows = [["method", "steps per second", "physics", "inference, rewards, resets", "updates and the rest"]]
+    rows.append(["---", *["---:"] * 4])
+    for method in study.methods(task):
+        parts = [_split(c) for c in study.curves_of(task, method).values()]
+        every = np.concatenate([np.zeros((3, 0)), *parts], axis=1)
+        if not every.shape[1]:
+            rows.append([label(method), *["-"] * 4])
+            continue
+        shares = np.median(every, axis=1)
+        rate = 1 / seconds_per_step(study, task, method)
+        rows.append([label(method), f"{rate:,.0f}", *(f"{share:.0%}" for share in shares)])
+    note = (
+        "Medians of one run: a process with one thread, beside as many others as ran at a time.\n"
+        "*updates and the rest*: all that is not the collection of data.\n"
+    )
+    return markdown(rows) + "\n" + note
+
+
+def _split(curve: dict[str, np.ndarray]) -> np.ndarray:
+    """Shares of physics, the rest of the collection, and the rest, ``(3, intervals)``."""
+    whole = np.diff(curve["seconds"]) / np.diff(curve["frames"])
+    same = np.diff(curve.get("stage", np.zeros(len(curve["frames"])))) == 0
+    steps = (np.diff(curve["frames"]) / np.maximum(np.diff(curve["iteration"]), 1))[same]
+    each = whole[same] * steps  # seconds of an iteration
+    physics, collect = (curve[f"{name}_seconds"][1:][same] for name in ("physics", "collect"))
+    shares = np.stack([physics, collect - physics, each - collect]) / each
+    return shares[:, np.isfinite(shares).all(axis=0)]

@@ -1,0 +1,77 @@
+"""Rules that turn a difference of two methods into a verdict, and the figures that they are given.
+
+Two methods are compared by the difference of interquartile means over seeds and its 95 % bootstrap
+interval: *confirmed* if the interval lies on the claimed side of zero, *different* if it lies on the other
+side, *not confirmed* if it contains zero. That something gains nothing is confirmed if the whole interval
+is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy import stats
+
+from comparison.intervals import Estimate, difference, iqm
+from comparison.methods import label
+from comparison.study import Study
+from comparison.tables import steps_to, threshold, variation
+
+Judgement = tuple[str, str]  # evidence, verdict
+
+
+def returns(study: Study, method: str, *, task: str, **which: str | None) -> np.ndarray:
+    """Evaluated return of every seed, or what else `Study.goal_returns` is asked for."""
+    return study.goal_returns(task, method, **which)[1].mean(axis=1)
+
+
+def variations(study: Study, method: str, *, task: str, **which: str | None) -> np.ndarray:
+    """Difference between the goals, of every seed."""
+    return variation(study.goal_returns(task, method, **which)[1])
+
+
+def symmetry_loss(study: Study, method: str, *, task: str) -> np.ndarray:
+    """Decimal logarithm of the last symmetry loss of every seed."""
+    return np.log10(np.maximum(study.curve(task, method, "mirror_loss")[1][:, -1], 1e-12))
+
+
+def steps(study: Study, method: str, *, task: str) -> np.ndarray:
+    """Million steps to the threshold; seeds that never reach it count as the whole run."""
+    reached = steps_to(study, task, method, threshold(study, task))
+    return np.minimum(reached, study.curve(task, method, "progress")[0][-1])
+
+
+def verdict(claimed_positive: Estimate) -> str:
+    """The rule for a difference that the paper says is positive."""
+    if claimed_positive.low > 0:
+        return "confirmed"
+    return "different" if claimed_positive.high < 0 else "not confirmed"
+
+
+def no_gain(gain: Estimate, margin: float) -> str:
+    """The rule for a gain that the paper says is none."""
+    if gain.low > 0:
+        return "different"
+    return "confirmed" if gain.high < margin else "not confirmed"
+
+
+def more(a: tuple[int, int], b: tuple[int, int]) -> str:
+    """The rule for counts, of a total each, of which the paper says the first is larger."""
+    table = [[a[0], a[1] - a[0]], [b[0], b[1] - b[0]]]
+    if stats.fisher_exact(table, alternative="greater").pvalue < 0.05:
+        return "confirmed"
+    return "different" if stats.fisher_exact(table, alternative="less").pvalue < 0.05 else "not confirmed"
+
+
+def pair(study: Study, what: Callable, a: str, b: str, digits: int = 3) -> tuple[str, Estimate]:
+    """Both interquartile means, and the difference of the first minus the second, as text and number."""
+    x, y = what(study, a), what(study, b)
+    gap = difference(x, y)
+    values = f"{label(a)} {iqm(x):.{digits}f}, {label(b)} {iqm(y):.{digits}f}"
+    return f"{values}, difference {gap.format(digits)}", gap
+
+
+def joined(**verdicts: str) -> str:
+    """One verdict if all agree, or else each with its name."""
+    if len(set(verdicts.values())) == 1:
+        return next(iter(verdicts.values()))
+    return ", ".join(f"{name.replace('_', ' ')}: {outcome}" for name, outcome in verdicts.items())
