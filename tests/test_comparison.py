@@ -16,8 +16,9 @@ from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
 from comparison.run import Run, environment, read_curve, task_setting
 from comparison.study import Study, read, write
+from tasks.anymal_push import AnymalPush
 from tasks.settings import SETTINGS
-from torchrl_sym.recipes import train
+from torchrl_sym.recipes import load_actor, train
 
 
 def test_a_method_is_a_sum_of_parts():
@@ -245,6 +246,26 @@ def test_results_survive_writing_and_reading(tmp_path):
     assert longer.result() is None
     with pytest.raises(ValueError, match="got a run with other settings"):
         longer.execute()
+
+
+def test_the_policy_of_the_best_seed_is_kept(tmp_path):
+    setting = SETTINGS["anymal_push"].replace(iterations=1, num_envs=4, horizon=4, minibatches=1)
+    setting = dataclasses.replace(setting, evaluations={"task": {"episode_seconds": 0.1}}, then=())
+    runs = [Run("anymal_push", "ppo", s, setting.replace(seed=s), tmp_path / str(s), 1) for s in (0, 1)]
+    for run in runs:
+        run.execute()
+        found = run.result()["evaluation"]
+        assert {row["goal"] for row in found if row["turning"] > 0} == set(AnymalPush.goal_names)
+    write(tmp_path / "results", runs, [], {"workers": 1})
+    sampled = [
+        np.mean([row["return"] for row in run.result()["evaluation"] if row["actions"] == "sampled"])
+        for run in runs
+    ]
+    env = environment("anymal_push")(num_envs=1)
+    kept = load_actor(tmp_path / "results/checkpoints/anymal_push/ppo", env, env.symmetry)
+    best = load_actor(runs[int(np.argmax(sampled))].folder / "stage_0", env, env.symmetry)
+    assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
+    assert np.isfinite(read(tmp_path / "results").goal_returns("anymal_push", "ppo", "turning")[1]).all()
 
 
 def test_stages_follow_each_other_also_after_an_interruption(tmp_path):

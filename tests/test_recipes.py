@@ -44,6 +44,9 @@ def test_every_method_trains_and_reports(symmetry, augmentation, mirror_coeff):
     assert [row["frames"] for row in rows] == [128, 256, 384, 512]
     for key in ("kl", "mirror_loss", "log_prob", "log_prob_copies", "loss_critic", "entropy"):
         assert all(torch.tensor(row[key]).isfinite() for row in rows), key
+    before = [0.0, *(row["seconds"] for row in rows)]
+    for row, start in zip(rows, before, strict=False):
+        assert 0 < row["physics_seconds"] < row["collect_seconds"] < row["seconds"] - start + 0.5
 
 
 def test_methods_differ(symmetry):

@@ -31,6 +31,15 @@ def test_step_observation_and_reward_commute_with_the_group(name, g):
     assert equivariance_error(task, task.symmetry, g, steps) <= TOLERANCE[name]
 
 
+@all_elements
+def test_behaviour_is_the_same_for_mirror_images(name, g):
+    task = base.create(name)
+    state = reached(task, task.sample_initial_state(8, torch.Generator().manual_seed(0)), steps=10)
+    images = task.behaviour(task.transform_state(state, g))
+    for figure, value in task.behaviour(state).items():
+        torch.testing.assert_close(images[figure], value, msg=figure)
+
+
 @all_settings
 def test_verify_finds_every_part_symmetric_in_contact(name, kwargs):
     env = make(name, num_envs=16, **kwargs)
