@@ -378,7 +378,7 @@ def robot_world(right):
 @pytest.mark.parametrize("right", [True, False])
 def test_verdicts_on_robots_turn_with_the_data(right):
     lines = robot_claims.table(robot_world(right), "robot").splitlines()[2:]
-    assert len(lines) == len(robot_claims.CLAIMS) == 7
+    assert len(lines) == len(robot_claims.CLAIMS) == 8
     for line in lines:
         assert line.endswith("**confirmed** |" if right else "**different** |"), line
 
@@ -386,6 +386,9 @@ def test_verdicts_on_robots_turn_with_the_data(right):
 def test_claims_about_robots_need_their_methods():
     study = robot_world(True)
     study.about["methods"]["robot"] = {"ppo": None, "aug": None}
+    assert len(robot_claims.table(study, "robot").splitlines()) == 2 + 6
+    for curve in study.curves.values():
+        del curve["phase"]
     assert len(robot_claims.table(study, "robot").splitlines()) == 2 + 5
 
 
@@ -424,6 +427,17 @@ def test_progress_in_a_curriculum_is_the_level_that_is_mastered_in_the_last_phas
     assert tables.measured(study, "robot") == "training return"
 
 
+def test_recovery_is_counted_from_the_start_of_the_last_phase():
+    study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=2)
+    falls_and_rises = np.concatenate([np.full(10, 9.0), np.full(8, 1.0), np.full(12, 7.0)])
+    first, second = study.curves.values()
+    first["return"] = falls_and_rises
+    first["phase"] = np.repeat([0.0, 1.0, 2.0], [5, 5, 20])
+    second["phase"] = np.zeros(30)
+    # The mean of five points is at 7 from the 13th point of the phase on: 1.2 million steps later.
+    assert verdicts.recovery(study, "ppo", task="robot").tolist() == pytest.approx([1.2, 3.0])
+
+
 def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkeypatch):
     study, cartpole = robot_world(True), world(PAPER_IS_RIGHT, seeds=2)
     for column in ("phase", "level", "success", "physics_seconds"):  # one table of curves for all tasks
@@ -440,12 +454,12 @@ def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkey
     assert text.count("Mean actions:") == 1 and "nan" not in text
     monkeypatch.setitem(results_page.ROBOTS, "paper-robot", "robot")
     page = results_page.robot_section("paper-robot", both)
-    assert page.count("**confirmed**") == 7 and "too narrow" not in page
+    assert page.count("**confirmed**") == 8 and "too narrow" not in page
 
 
 def test_a_method_without_any_evaluated_seed_is_named():
     study = robot_world(True)
     lost = Study(study.about, [r for r in study.runs if r["method"] != "ppo"], study.curves)
     table = robot_claims.table(lost, "robot")
-    assert table.count("no seed of PPO was evaluated") == 6
+    assert table.count("no seed of PPO was evaluated") == 7
     assert "| PPO | 0 | - |" in robot_tables.success_table(lost, "robot")

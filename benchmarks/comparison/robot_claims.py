@@ -19,6 +19,7 @@ from comparison.verdicts import (
     joined,
     no_gain,
     pair,
+    recovery,
     returns,
     steps,
     symmetry_loss,
@@ -131,6 +132,20 @@ def _speed(results: Results) -> Judgement:
         outcomes[f"than {slower}"] = verdict(gap)
     what = measured(results.study, results.task)
     return f"million steps to nine tenths of the {what}: {'; '.join(texts)}", joined(**outcomes)
+
+
+@claim(
+    "When starts get any heading, augmentation recovers almost at once.", "Sec. IV-C, Fig. 4", "ppo", "aug"
+)
+def _recovery(results: Results) -> Judgement | None:
+    curves = results.study.curves_of_task(results.task)
+    if not any(np.isfinite(curve.get("phase", np.nan)).any() for curve in curves):
+        return None
+    of = partial(recovery, task=results.task)
+    text, gap = pair(results.study, of, "ppo", "aug", 2)
+    return f"million steps from the start of phase C to nine tenths of what is regained: {text}", verdict(
+        gap
+    )
 
 
 @claim("Without augmentation, the robot turns round to use its favourite limbs.", "Sec. IV-F", "ppo", "aug",

@@ -13,8 +13,8 @@ from scipy import stats
 
 from comparison.intervals import Estimate, difference, iqm
 from comparison.methods import label
-from comparison.study import Study
-from comparison.tables import steps_to, threshold, variation
+from comparison.study import LAST_PHASE, Study
+from comparison.tables import SHARE, SMOOTHING, smooth, steps_to, threshold, variation
 
 Judgement = tuple[str, str]  # evidence, verdict
 
@@ -38,6 +38,27 @@ def steps(study: Study, method: str, *, task: str) -> np.ndarray:
     """Million steps to the threshold; seeds that never reach it count as the whole run."""
     reached = steps_to(study, task, method, threshold(study, task))
     return np.minimum(reached, study.curve(task, method, "progress")[0][-1])
+
+
+def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
+    """Million steps from the start of a curriculum's last phase to nine tenths of what is regained in it.
+
+    That is, of the way from the lowest training return of the phase to the last one; a seed that never
+    enters the phase counts as its whole run.
+    """
+    taken = []
+    for curve in study.curves_of(task, method).values():
+        there = np.flatnonzero(curve["phase"] == LAST_PHASE)
+        steps_, level = curve["frames"][there] / 1e6, curve["return"][there]
+        if len(there) < SMOOTHING:
+            taken.append(curve["frames"][-1] / 1e6)
+            continue
+        level = smooth(level[None])[0]
+        lowest = int(level.argmin())
+        goal = (1 - SHARE) * level[lowest] + SHARE * level[-1]
+        regained = lowest + int((level[lowest:] >= goal).argmax())
+        taken.append(steps_[regained + SMOOTHING - 1] - steps_[0])
+    return np.array(taken)
 
 
 def verdict(claimed_positive: Estimate) -> str:
