@@ -32,7 +32,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@touch $@
 
 # A robot policy is replayed at the end; the film needs OpenGL, the picture of its paths does not.
-PUSH := anymal_push --checkpoint benchmarks/results/paper-push/checkpoints/anymal_push/aug --stochastic
+PUSH := anymal_push --checkpoint benchmarks/results/paper-push/checkpoints/anymal_push/aug
 quickstart: $(INSTALLED)
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png

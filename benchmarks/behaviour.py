@@ -8,7 +8,7 @@
 * `TASK_frames`: key frames of the first two goals, a row per method and goal.
 
 Episodes are paired: every goal starts from the image of the same states. Drawn for the best seed of each
-method, with sampled actions.
+method, with mean actions.
 """
 
 import os
@@ -24,7 +24,6 @@ import mujoco
 import numpy as np
 import torch
 import tyro
-from torchrl.envs.utils import ExplorationType
 
 from comparison.methods import label
 from tasks.anymal import LEGS
@@ -76,15 +75,14 @@ class Recording:
 
 
 def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
-    """Episodes of all goals with sampled actions, from the images of the same starts."""
+    """Episodes of all goals with mean actions, from the images of the same starts."""
     order = task.symmetry.group.order
     elements = [g for g in range(order) for _ in range(episodes)]
     env = BatchedEnv(task, len(elements), num_threads=1, seed=0)
     canonical = task.sample_goal_state(episodes, torch.Generator().manual_seed(SEED))
     start = concatenate([task.transform_state(canonical, g) for g in range(order)])
-    torch.manual_seed(SEED)
     actor = load_actor(checkpoint, env, env.symmetry)
-    return Recording(task, record(env, actor, start, exploration=ExplorationType.RANDOM), elements)
+    return Recording(task, record(env, actor, start), elements)
 
 
 def paths(recordings: dict[str, Recording]):

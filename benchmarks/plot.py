@@ -233,9 +233,9 @@ def goals(study: Study):
     for axis, task in zip(axes[0], study.tasks, strict=True):
         methods, legend_goals = study.methods(task), []
         succeeds = has_success(study, task)
-        which = {"column": "success", "actions": "sampled"} if succeeds else {}
+        column = "success" if succeeds else "return"
         for place, method in enumerate(methods):
-            names, values = study.goal_returns(task, method, **which)
+            names, values = study.goal_returns(task, method, column)
             offsets = np.linspace(-0.3, 0.3, len(values)) if len(values) > 1 else np.zeros(len(values))
             for x, row in zip(place + offsets, values, strict=True):
                 axis.plot([x, x], [row.min(), row.max()], color=color(method), linewidth=1, alpha=0.6)

@@ -42,7 +42,7 @@ ROBOT_CAPTIONS = {
     "training": "Training return and symmetry loss.",
     "success": "Success in training and the level of the curriculum.",
     "phases": "Every seed's training return through the phases of the curriculum.",
-    "goals": "Success of every seed on every equivalent goal, with sampled actions.",
+    "goals": "Success of every seed on every equivalent goal.",
     "efficiency": "Share of seeds that have come so far, over environment steps and over time.",
 }
 
@@ -186,7 +186,7 @@ def readme_robot_block(study: Study) -> str:
     table = success_table(study, task, columns=columns)
     episodes = " to ".join(map(str, study.about["episodes"]))
     text = prose(f"""Interquartile means over seeds with 95 % bootstrap intervals, {episodes} episodes of
-        every goal, sampled actions. *spread*: the largest difference between two equivalent goals of a
+        every goal, mean actions. *spread*: the largest difference between two equivalent goals of a
         seed, in percentage points; *turning*: yaw travelled in an episode.""")
     return f"After {steps:.1f} million steps, {seeds} seeds per method:\n\n{table}\n{text}\n"
 

@@ -257,13 +257,13 @@ def test_the_policy_of_the_best_seed_is_kept(tmp_path):
         found = run.result()["evaluation"]
         assert {row["goal"] for row in found if row["turning"] > 0} == set(AnymalPush.goal_names)
     write(tmp_path / "results", runs, [], {"workers": 1})
-    sampled = [
-        np.mean([row["return"] for row in run.result()["evaluation"] if row["actions"] == "sampled"])
+    means = [
+        np.mean([row["return"] for row in run.result()["evaluation"] if row["actions"] == "deterministic"])
         for run in runs
     ]
     env = environment("anymal_push")(num_envs=1)
     kept = load_actor(tmp_path / "results/checkpoints/anymal_push/ppo", env, env.symmetry)
-    best = load_actor(runs[int(np.argmax(sampled))].folder / "stage_0", env, env.symmetry)
+    best = load_actor(runs[int(np.argmax(means))].folder / "stage_0", env, env.symmetry)
     assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
     assert np.isfinite(read(tmp_path / "results").goal_returns("anymal_push", "ppo", "turning")[1]).all()
 
@@ -342,7 +342,7 @@ def make_robot_study(figures, losses, starts, seeds=5):
                 row = {"task": "robot", "method": method, "seed": seed, "outcome": "finished"}
                 row |= {"what": "task", "goal": goal, "return": 12 * share, "task_return": 10 * share}
                 for actions in ("sampled", "deterministic"):
-                    scale = 1.0 if actions == "sampled" else 0.5
+                    scale = 0.5 if actions == "sampled" else 1.0
                     row_ = row | {"actions": actions, "success": scale * share, "turning": turning}
                     rows.append(row_)
             level = np.full(30, 1.0) + noise.normal(size=30) * 0.01

@@ -1,7 +1,8 @@
 """The paper's claims that every robot task can decide, judged by the rules of `verdicts.py`.
 
-Returns, successes and turning are those of sampled actions, as in training; mean actions are in the tables.
-A claim whose methods are not in the study, or whose figures a task does not have, is left out.
+Returns, successes and turning are those of mean actions, whose episodes are paired: what differs between
+two goals is the policy's doing, not that of the noise. Sampled actions are in the tables. A claim whose
+methods are not in the study, or whose figures a task does not have, is left out.
 """
 
 from collections.abc import Callable
@@ -41,14 +42,13 @@ class Results:
     task: str
     what: str
 
-    def sampled(self, of: Callable, column: str = "return") -> Callable:
-        """A figure of sampled actions, to be handed to `pair`."""
-        return partial(of, task=self.task, what=self.what, column=column, actions="sampled")
+    def evaluated(self, of: Callable, column: str = "return") -> Callable:
+        """A figure of mean actions, to be handed to `pair`."""
+        return partial(of, task=self.task, what=self.what, column=column)
 
     def seeds(self, method: str, column: str = "return") -> int:
         """How many seeds of a method were evaluated."""
-        which = {"what": self.what, "column": column, "actions": "sampled"}
-        values = self.study.goal_returns(self.task, method, **which)[1]
+        values = self.study.goal_returns(self.task, method, column, what=self.what)[1]
         return int(np.isfinite(values).all(axis=1).sum())
 
     def losses(self) -> list[str]:
@@ -92,11 +92,11 @@ def figures(results: Results) -> dict[str, str]:
 def _return(results: Results) -> Judgement:
     texts, outcomes = [], {}
     for column, name in figures(results).items():
-        text, gap = pair(results.study, results.sampled(returns, column), "aug", "ppo")
+        text, gap = pair(results.study, results.evaluated(returns, column), "aug", "ppo")
         texts.append(f"{name}: {text}")
         outcomes[column] = verdict(gap)
     for loss in results.losses():
-        text, gap = pair(results.study, results.sampled(returns), "aug", loss)
+        text, gap = pair(results.study, results.evaluated(returns), "aug", loss)
         texts.append(f"return: {text}")
         outcomes[f"than {loss}"] = verdict(gap)
     return "; ".join(texts), joined(**outcomes)
@@ -106,7 +106,7 @@ def _return(results: Results) -> Judgement:
 def _variation(results: Results) -> Judgement:
     texts, outcomes = [], {}
     for column, name in figures(results).items():
-        of = results.sampled(variations, column)
+        of = results.evaluated(variations, column)
         text, gap = pair(results.study, of, "ppo", "aug")
         plain, copies = (of(results.study, method).mean() for method in ("ppo", "aug"))
         texts.append(f"{name}: {text}, ratio of means {plain / max(copies, 1e-12):.1f}")
@@ -151,7 +151,7 @@ def _recovery(results: Results) -> Judgement | None:
 @claim("Without augmentation, the robot turns round to use its favourite limbs.", "Sec. IV-F", "ppo", "aug",
        figure="turning")  # fmt: skip
 def _turning(results: Results) -> Judgement:
-    text, gap = pair(results.study, results.sampled(returns, "turning"), "ppo", "aug", 2)
+    text, gap = pair(results.study, results.evaluated(returns, "turning"), "ppo", "aug", 2)
     return f"yaw travelled in an episode, to and fro, gait included, rad: {text}", verdict(gap)
 
 
@@ -160,7 +160,7 @@ def _both(results: Results) -> Judgement | None:
     both = results.with_loss()
     if both is None:
         return None
-    text, gain = pair(results.study, results.sampled(returns), both, "aug")
+    text, gain = pair(results.study, results.evaluated(returns), both, "aug")
     margin = _margin(results)
     return f"return: {text}; margin {margin:.2f}", no_gain(gain, margin)
 
@@ -168,7 +168,7 @@ def _both(results: Results) -> Judgement | None:
 @claim("One random element per sample is as good as all of them.", "not in the paper", "aug", "aug-random",
        "ppo")  # fmt: skip
 def _random(results: Results) -> Judgement:
-    text, loss = pair(results.study, results.sampled(returns), "aug", "aug-random")
+    text, loss = pair(results.study, results.evaluated(returns), "aug", "aug-random")
     cost = [seconds_per_step(results.study, results.task, m) for m in ("ppo", "aug", "aug-random")]
     margin = _margin(results)
     text += f"; time per step over PPO's: {cost[2] / cost[0]:.2f}, all {cost[1] / cost[0]:.2f}"
@@ -176,7 +176,7 @@ def _random(results: Results) -> Judgement:
 
 
 def _margin(results: Results) -> float:
-    return NO_DIFFERENCE * abs(float(iqm(results.sampled(returns)(results.study, "aug"))))
+    return NO_DIFFERENCE * abs(float(iqm(results.evaluated(returns)(results.study, "aug"))))
 
 
 def table(study: Study, task: str, what: str | None = None) -> str:

@@ -17,7 +17,7 @@ from comparison.tables import (
     variation,
 )
 
-ACTIONS = {"sampled": "sampled actions, as in training", "deterministic": "mean actions"}
+ACTIONS = {"deterministic": "mean actions", "sampled": "sampled actions, as in training"}
 
 
 def tables(study: Study) -> str:
@@ -43,9 +43,9 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
     return text + (
         "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the\n"
         "lowest success of a goal (mean over seeds). *spread*: the largest difference between two goals\n"
-        "of a seed; the noise of sampled actions is not paired, so that about 3 points of success are\n"
-        "chance. *task return*: without terms of gait and effort. *turning*: yaw travelled in an episode.\n"
-        "*symmetry loss*: as in the paper, on the states of the last iteration.\n"
+        "of a seed; starts are paired, the noise of sampled actions is not, so that there about 3 points\n"
+        "of success are chance. *task return*: without terms of gait and effort. *turning*: yaw travelled\n"
+        "in an episode. *symmetry loss*: as in the paper, on the states of the last iteration.\n"
     )
 
 
@@ -53,7 +53,7 @@ def success_table(
     study: Study,
     task: str,
     methods: list[str] | None = None,
-    actions: str = "sampled",
+    actions: str = "deterministic",
     what: str | None = None,
     columns: Sequence[str] | None = None,
 ) -> str:
@@ -63,7 +63,7 @@ def success_table(
         study: the results.
         task: one of its tasks.
         methods: rows; all by default.
-        actions: `sampled` or `deterministic`.
+        actions: `deterministic` (mean actions) or `sampled`.
         what: one of the task's evaluations; the first by default.
         columns: names of the columns to show; all by default.
     """

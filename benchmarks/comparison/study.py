@@ -62,7 +62,7 @@ def write(
         episodes.add(result["episodes"])
         evaluated += [name | ended | row for row in rows]
         if rows[0].get("success") is not None:
-            score = float(np.mean([row["return"] for row in rows if row["actions"] == "sampled"]))
+            score = float(np.mean([row["return"] for row in rows if row["actions"] == "deterministic"]))
             best.setdefault((run.task, run.method), []).append((score, run))
         curve = read_curve(run.folder)
         every = math.ceil(
