@@ -111,6 +111,8 @@ class Arguments:
     """Evaluation episodes per goal."""
     workers: int = os.cpu_count() or 1
     """Runs at a time."""
+    collect: bool = False
+    """Train nothing: write and draw what has been finished so far."""
     threads: int = 1
     """Threads per run."""
     name: str | None = None
@@ -129,11 +131,11 @@ def main(arguments: Arguments) -> int:
     name = arguments.name or arguments.preset or "custom"
     shared = "paper" if (arguments.preset or "").startswith("paper") else name  # they have runs in common
     runs = make_runs(arguments, arguments.folder / shared)
-    failed = execute_all(runs, arguments.workers)
+    failed = [] if arguments.collect else execute_all(runs, arguments.workers)
     for run in failed:
         print(f"FAILED: {run} (see {run.folder / 'log.txt'})")
-    if len(failed) == len(runs):
-        print("every run failed; there is nothing to write")
+    if not any(run.result() for run in runs):
+        print("no run has been finished; there is nothing to write")
         return 1
     about = {"workers": arguments.workers, "threads": arguments.threads}
     study.write(arguments.output / name, runs, failed, about)

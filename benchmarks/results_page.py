@@ -132,9 +132,13 @@ def robot_section(name: str, study: Study) -> str:
         {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
         `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
         found with augmentation and are used for all methods; none was tuned by itself.""")
+    if about.get("unfinished"):
+        made += "\n\n" + prose(f"""**Still in progress**: {len(about["unfinished"])} runs of this comparison
+            have not been made yet. The same command makes them.""")
     if seeds < FEW:
-        made += "\n\n" + prose(f"""With {seeds} seeds, a bootstrap interval is too narrow: where two methods
-            do not differ, one verdict in ten is *confirmed* by chance (one in thirty with five seeds).""")
+        made += "\n\n" + prose(f"""Seeds of PPO and of augmentation: {seeds}. Verdicts need {FEW}: with
+            three, where two methods do not differ, one in ten is *confirmed* by chance, with five one in
+            thirty; a single seed has no interval, and decides nothing.""")
     judged = "\n".join(
         (f"### Claims: {what}\n\n" if what != "task" else "") + robot_claims.table(study, task, what)
         for what in study.evaluations(task)

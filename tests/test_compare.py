@@ -2,6 +2,7 @@
 
 import collections
 import csv
+import dataclasses
 import json
 import math
 import os
@@ -119,6 +120,14 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
         assert rows(whole / "results/custom" / name) == rows(killed / "results/custom" / name)
     about = [(folder / "results/custom/study.json").read_text() for folder in (whole, killed)]
     assert about[0] == about[1]
+    # What is finished can be looked at while the rest is not, without training anything.
+    changes = {"seeds": 1, "steps": 8 * 25 * 12, "config": tuple(TINY[1:]), "episodes": 2, "collect": True}
+    places = {"folder": whole / "runs", "output": tmp_path / "results", "plots": tmp_path / "plots"}
+    asked = compare_script.Arguments(methods=("ppo", "loss-1"), **changes, **places)
+    assert compare_script.main(asked) == 0
+    part = study.read(tmp_path / "results" / "custom")
+    assert part.methods("cartpole") == ["ppo"] and part.about["unfinished"] == ["cartpole loss-1 0"]
+    assert compare_script.main(dataclasses.replace(asked, methods=("loss-1",))) == 1
 
 
 def test_what_fails_is_reported_and_stops_nothing(tmp_path):

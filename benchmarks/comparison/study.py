@@ -81,6 +81,7 @@ def write(
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
     about |= {"failed": [str(run) for run in failed], "methods": methods}
+    about["unfinished"] = [str(run) for run in runs if run not in failed and run.result() is None]
     write_json(folder / "study.json", about)
 
 
