@@ -36,7 +36,7 @@ from torchrl_sym.recipes import load_actor
 HERE = Path(__file__).parent
 SEED = 2000  # of starts: not those of the evaluation
 FRAMES = 5  # key frames of an episode
-LIMBS = (*LEGS, "base")
+LIMBS = (*LEGS, "head", "tail")  # the last two are the front and the back half of the trunk
 
 
 @dataclass
@@ -102,29 +102,32 @@ def paths(recordings: dict[str, Recording]):
 
 
 def touches(recording: Recording, body: str) -> np.ndarray:
-    """Share of the time in contact that each limb has a part in, ``(goals, limbs)``."""
-    model = recording.task.model
+    """Share of the time in contact in which each limb is, ``(goals, limbs)``; NaN without contact."""
+    task, model = recording.task, recording.task.model
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
-    touched = model.body(body).id
-    limb = np.full(model.nbody, -1)
-    for number in range(model.nbody):
-        prefix = model.body(number).name.split("_")[0]
-        limb[number] = LIMBS.index(prefix) if prefix in LIMBS else -1
-    counts = np.zeros((len(recording.task.goal_names), len(LIMBS) + 1))
+    touched, trunk = model.body(body).id, model.body("base").id
+    prefixes = [model.body(number).name.split("_")[0] for number in range(model.nbody)]
+    counts = np.zeros((len(task.goal_names), len(LIMBS) + 1))
     fallen = torch.zeros(len(recording.elements), dtype=torch.bool)
     for state in recording.states:
-        over = recording.task.terminated(state)
+        over = task.terminated(state)
         fallen = fallen if over is None else fallen | over
-        for row, g in enumerate(recording.elements):
-            if fallen[row]:
-                continue
+        for row in np.flatnonzero(~fallen.numpy()):
             data.qpos[:] = state.qpos[row].numpy()
             mujoco.mj_fwdPosition(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-            pairs = model.geom_bodyid[data.contact.geom]
-            others = pairs[(pairs == touched).any(axis=1)]
-            found = {int(n) for n in limb[others].ravel() if n >= 0}
-            counts[g, list(found)] += 1
-            counts[g, -1] += bool(found)
+            found = set()
+            for pair, place in zip(model.geom_bodyid[data.contact.geom], data.contact.pos, strict=True):
+                other = pair[pair != touched]
+                if len(other) != 1:
+                    continue
+                if other[0] == trunk:
+                    ahead = (place - data.xpos[trunk]) @ data.xmat[trunk].reshape(3, 3)[:, 0]
+                    found.add("head" if ahead > 0 else "tail")
+                elif prefixes[other[0]] in LIMBS:
+                    found.add(prefixes[other[0]])
+            goal = recording.elements[row]
+            counts[goal, [LIMBS.index(limb) for limb in found]] += 1
+            counts[goal, -1] += bool(found)
     with np.errstate(invalid="ignore"):
         return counts[:, :-1] / counts[:, -1:]
 
@@ -151,11 +154,13 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
     rows, captions = [], []
     for method, recording in recordings.items():
         task = recording.task
+        cameras = [task.model.camera(i).name for i in range(task.model.ncam)]
+        camera = "follow" if "follow" in cameras else None
         chosen = np.linspace(0, len(recording.states) - 1, FRAMES).round().astype(int)
         for g in goals:
             first = recording.elements.index(g)
             states = [recording.states[i].rows(torch.tensor([first])) for i in chosen]
-            rows.append([image[0] for image in render(task, states)])
+            rows.append([image[0] for image in render(task, states, camera=camera)])
             name = f"{label(method)}, {task.goal_names[g]}"
             captions.append([f"{name}, {i * task.control_timestep:.1f} s" for i in chosen])
     return sheet(rows, captions)

@@ -138,7 +138,7 @@ def robot_section(name: str, study: Study) -> str:
     if seeds < FEW:
         made += "\n\n" + prose(f"""Seeds of PPO and of augmentation: {seeds}. Verdicts need {FEW}: with
             three, where two methods do not differ, one in ten is *confirmed* by chance, with five one in
-            thirty; a single seed has no interval, and decides nothing.""")
+            thirty; a single seed has no interval and decides nothing.""")
     judged = "\n".join(
         (f"### Claims: {what}\n\n" if what != "task" else "") + robot_claims.table(study, task, what)
         for what in study.evaluations(task)

@@ -156,6 +156,8 @@ def test_verdicts_follow_the_interval():
     assert verdicts.verdict(Estimate(1.0, 0.1, 2.0)) == "confirmed"
     assert verdicts.verdict(Estimate(1.0, -0.1, 2.0)) == "not confirmed"
     assert verdicts.verdict(Estimate(-1.0, -2.0, -0.1)) == "different"
+    for rule in (verdicts.verdict, lambda gap: verdicts.no_gain(gap, 0.5)):
+        assert rule(Estimate(1.0, -math.inf, math.inf)) == "undecided"
     assert verdicts.no_gain(Estimate(1.0, 0.1, 2.0), 0.5) == "different"
     assert verdicts.no_gain(Estimate(1.0, -0.1, 2.0), 0.5) == "not confirmed"
     assert verdicts.no_gain(Estimate(0.1, -0.1, 0.3), 0.5) == "confirmed"

@@ -6,6 +6,7 @@ side, *not confirmed* if it contains zero. That something gains nothing is confi
 is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -62,14 +63,18 @@ def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
 
 
 def verdict(claimed_positive: Estimate) -> str:
-    """The rule for a difference that the paper says is positive."""
+    """The rule for a difference that the paper says is positive; undecided without an interval."""
+    if not math.isfinite(claimed_positive.low):
+        return "undecided"
     if claimed_positive.low > 0:
         return "confirmed"
     return "different" if claimed_positive.high < 0 else "not confirmed"
 
 
 def no_gain(gain: Estimate, margin: float) -> str:
-    """The rule for a gain that the paper says is none."""
+    """The rule for a gain that the paper says is none; undecided without an interval."""
+    if not math.isfinite(gain.low):
+        return "undecided"
     if gain.low > 0:
         return "different"
     return "confirmed" if gain.high < margin else "not confirmed"
