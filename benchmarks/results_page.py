@@ -185,14 +185,26 @@ def readme_robot_block(study: Study) -> str:
     """What the README says of ANYmal-Push."""
     task = "anymal_push"
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-    seeds = " to ".join(map(str, sorted({len(study.seeds(task, m)) for m in study.methods(task)})))
-    columns = ("method", "seeds", "success [%]", "worst goal [%]", "spread [%]", "turning [rad]")
-    table = success_table(study, task, columns=columns)
+    methods = [m for m in study.methods(task) if len(study.seeds(task, m)) > 1] or study.methods(task)
+    columns = (
+        "method",
+        "seeds",
+        "success [%]",
+        "worst goal [%]",
+        "spread [%]",
+        "return",
+        "spread of return",
+    )
+    table = success_table(study, task, methods, columns=columns)
     episodes = " to ".join(map(str, study.about["episodes"]))
     text = prose(f"""Interquartile means over seeds with 95 % bootstrap intervals, {episodes} episodes of
-        every goal, mean actions. *spread*: the largest difference between two equivalent goals of a
-        seed, in percentage points; *turning*: yaw travelled in an episode.""")
-    return f"After {steps:.1f} million steps, {seeds} seeds per method:\n\n{table}\n{text}\n"
+        every goal, mean actions. *spread*: the largest difference between two equivalent goals of a seed,
+        in percentage points of success or in return.""")
+    if study.about.get("unfinished"):
+        text += "\n" + prose(
+            f"More seeds and methods are being trained: {len(study.about['unfinished'])} runs."
+        )
+    return f"ANYmal-Push after {steps:.1f} million steps:\n\n{table}\n{text}\n"
 
 
 def prose(text: str) -> str:
