@@ -33,7 +33,7 @@ $(INSTALLED): pyproject.toml constraints.txt
 
 # A robot's policy is replayed at the end: paths from above, then key frames, which need OpenGL. A film
 # (--out push.gif) takes a minute more.
-PUSH := anymal_push --checkpoint benchmarks/results/paper-push/checkpoints/anymal_push/aug
+PUSH := anymal_push --checkpoint benchmarks/results/paper-push/policies/anymal_push/aug
 quickstart: $(INSTALLED)
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png

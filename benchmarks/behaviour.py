@@ -1,4 +1,4 @@
-"""Pictures of what policies do on equivalent goals, from the checkpoints that a comparison keeps.
+"""Pictures of what policies do on equivalent goals, that a comparison keeps.
 
     python benchmarks/behaviour.py paper-push
 
@@ -168,7 +168,7 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
 
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    checkpoints = arguments.results / arguments.name / "checkpoints"
+    checkpoints = arguments.results / arguments.name / "policies"
     if not checkpoints.is_dir():
         raise SystemExit(f"expected policies in {checkpoints}, found none; run compare.py on a robot task")
     plots = arguments.plots / arguments.name

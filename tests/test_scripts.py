@@ -84,17 +84,6 @@ def test_learn_evaluates_and_draws_a_robot_task(tmp_path):
     run("benchmarks/learn.py", "anymal_climb", "--plot", *folders)
     assert (results / "curve.png").stat().st_size > 10_000
     assert "| anymal_climb | any heading |" in (tmp_path / "results" / "README.md").read_text()
-    policy = [
-        "--checkpoint",
-        results,
-        "--seconds",
-        "0.04",
-        "--width",
-        "64",
-        "--out",
-        tmp_path / "policy.png",
-    ]
-    run("examples/watch.py", "anymal_climb", *policy)
 
 
 @pytest.mark.parametrize("suffix", ["png", "gif"])

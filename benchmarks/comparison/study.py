@@ -3,7 +3,7 @@
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
 * `study.json`: command, commit, versions, machine; hyper-parameters per task and method; what failed.
-* `checkpoints/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
+* `policies/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
   succeed or fail; `examples/watch.py` and `behaviour.py` read it.
 """
 
@@ -74,7 +74,7 @@ def write(
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
-        export_actor(stage_folders(run.folder)[-1], folder / "checkpoints" / run.task / run.method)
+        export_actor(stage_folders(run.folder)[-1], folder / "policies" / run.task / run.method)
     first = (*RUN, "outcome", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
