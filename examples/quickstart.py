@@ -35,7 +35,7 @@ class Arguments:
 
     seeds: int = 3
     """Seeds per method."""
-    iterations: int = 175
+    iterations: int = 150
     """Iterations per run, of 16384 steps each; the effect on the return shows after about 150."""
     episodes: int = 500
     """Evaluation episodes per starting side."""
