@@ -1,4 +1,4 @@
-"""Pictures of what policies do on equivalent goals, that a comparison keeps.
+"""Pictures of what the policies that a comparison keeps do on equivalent goals.
 
     python benchmarks/behaviour.py paper-push
 
@@ -30,7 +30,7 @@ from tasks.anymal import LEGS
 from tasks.base import Task, create
 from tasks.environment import BatchedEnv
 from tasks.rendering import draw_paths, record, render, save, sheet
-from tasks.state import State, concatenate
+from tasks.state import State
 from torchrl_sym.recipes import load_actor
 
 HERE = Path(__file__).parent
@@ -79,8 +79,7 @@ def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
     order = task.symmetry.group.order
     elements = [g for g in range(order) for _ in range(episodes)]
     env = BatchedEnv(task, len(elements), num_threads=1, seed=0)
-    canonical = task.sample_goal_state(episodes, torch.Generator().manual_seed(SEED))
-    start = concatenate([task.transform_state(canonical, g) for g in range(order)])
+    start = task.sample_goal_states(episodes, torch.Generator().manual_seed(SEED))
     actor = load_actor(checkpoint, env, env.symmetry)
     return Recording(task, record(env, actor, start), elements)
 

@@ -25,7 +25,6 @@ from torchrl.envs.utils import ExplorationType
 
 import tasks
 from tasks.rendering import overlay, record, render, save, sheet
-from tasks.state import concatenate
 from torchrl_sym.recipes import load_actor
 
 FPS = 25.0
@@ -81,8 +80,7 @@ def rollout(arguments):
         raise SystemExit(f"expected goals among {task.goal_names}, got {sorted(unknown)}")
     elements = [task.goal_names.index(name) for name in names]
     env = tasks.make_env(arguments.task, num_envs=len(elements), num_threads=1, seed=0)
-    canonical = task.sample_goal_state(1, torch.Generator().manual_seed(arguments.seed))
-    start = concatenate([task.transform_state(canonical, g) for g in elements])
+    start = task.sample_goal_states(1, torch.Generator().manual_seed(arguments.seed), elements)
     torch.manual_seed(arguments.seed)
     if arguments.checkpoint is None:
         policy = MirroredNoise(env, elements, arguments.seed)

@@ -17,7 +17,7 @@ import difflib
 import importlib.resources
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from tasks.simulation import Simulation
-from tasks.state import Element, State
+from tasks.state import Element, State, concatenate
 from torchrl_sym import PointGroup, Representation, Symmetry
 from torchrl_sym.mujoco import derive
 
@@ -153,6 +153,14 @@ class Task(abc.ABC):
         The start of the equivalent goal g is ``transform_state(state, g)``: the starts of all goals
         are paired, so that goals are compared on the same draws.
         """
+
+    def sample_goal_states(
+        self, n: int, generator: torch.Generator | None, elements: Sequence[int] | None = None
+    ) -> State:
+        """Paired starts, n of every goal, goal by goal; of some goals only, given their elements."""
+        canonical = self.sample_goal_state(n, generator)
+        goals = range(self.symmetry.group.order) if elements is None else elements
+        return concatenate([self.transform_state(canonical, g) for g in goals])
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Sample n start states for training, by default of all goals with equal chance.

@@ -20,7 +20,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from tasks.base import create
 from tasks.environment import BatchedEnv
-from tasks.state import concatenate
 
 
 @dataclass(frozen=True)
@@ -144,8 +143,7 @@ def evaluate(
         )
     order = task.symmetry.group.order
     generator = torch.Generator().manual_seed(seed)
-    canonical = task.sample_goal_state(episodes, generator)
-    starts = concatenate([task.transform_state(canonical, g) for g in range(order)])
+    starts = task.sample_goal_states(episodes, generator)
     batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, device=device)
     noise_seed = int(torch.randint(2**31, (), generator=generator))  # not the stream of the starts
     with torch.no_grad(), set_exploration_type(exploration), _seeded(noise_seed):

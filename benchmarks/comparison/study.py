@@ -51,9 +51,11 @@ def write(
     folder.mkdir(parents=True, exist_ok=True)
     evaluated, curves, methods, revisions, episodes = [], [], {}, set(), set()
     best: dict[tuple[str, str], list[tuple[float, Run]]] = {}
+    unfinished: list[str] = []
     for run in runs:
         result = run.result()
         if result is None:
+            unfinished += [str(run)] * (run not in failed)
             continue
         name = dict(zip(RUN, (run.task, run.method, run.seed), strict=True))
         ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
@@ -80,8 +82,7 @@ def write(
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
-    about |= {"failed": [str(run) for run in failed], "methods": methods}
-    about["unfinished"] = [str(run) for run in runs if run not in failed and run.result() is None]
+    about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
     write_json(folder / "study.json", about)
 
 
