@@ -220,7 +220,8 @@ class Matcher:
         misaligned = 1 - abs(float(self.matrix @ data.xaxis[i] @ axis))
         if kind == SLIDE:
             return misaligned  # a slide's anchor does not matter
-        return misaligned + float(np.linalg.norm(np.cross(offset, axis))) / self.extent
+        offset -= (offset @ axis) * axis  # a hinge's anchor may be anywhere on its axis
+        return misaligned + float(np.linalg.norm(offset)) / self.extent
 
     def _pair_of_links(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
         """Cost of mapping subtree a onto subtree b, and the best pairs of children."""
