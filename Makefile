@@ -40,7 +40,7 @@ quickstart: $(INSTALLED)
 	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png
 
 test: $(INSTALLED)
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(PYTEST_ARGS)
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

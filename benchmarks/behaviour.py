@@ -73,6 +73,13 @@ class Recording:
     states: list[State]
     elements: list[int]
 
+    def first(self, episodes: int) -> "Recording":
+        """The first episodes of every goal."""
+        each = self.elements.count(0)
+        rows = [g * each + k for g in range(len(self.elements) // each) for k in range(episodes)]
+        states = [state.rows(torch.tensor(rows)) for state in self.states]
+        return Recording(self.task, states, [self.elements[row] for row in rows])
+
 
 def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
     """Episodes of all goals with mean actions, from the images of the same starts."""
@@ -179,12 +186,13 @@ def main(arguments: Arguments) -> None:
         if not kept:
             print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
             continue
-        recordings = {m: play(task, folder, arguments.episodes) for m, folder in kept.items()}
+        pushing = name == "anymal_push"
+        played = max(arguments.episodes, arguments.touching * pushing)
+        recordings = {m: play(task, folder, played) for m, folder in kept.items()}
         drawn = {}
-        if name == "anymal_push":
-            drawn["paths"] = paths(recordings)
-            many = {m: play(task, folder, arguments.touching) for m, folder in kept.items()}
-            shares = {m: touches(recording, "cube") for m, recording in many.items()}
+        if pushing:
+            drawn["paths"] = paths({m: each.first(arguments.episodes) for m, each in recordings.items()})
+            shares = {m: touches(recording, "cube") for m, recording in recordings.items()}
             drawn["touches"] = draw_touches(shares, task.goal_names, "cube")
         for kind, figure in drawn.items():
             figure.savefig(plots / f"{name}_{kind}.png", dpi=110)

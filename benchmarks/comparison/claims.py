@@ -1,8 +1,6 @@
 """Every claim of the paper that CartPole can decide, judged by a rule on the stored results."""
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -12,7 +10,7 @@ from comparison.intervals import difference, iqm
 from comparison.methods import label
 from comparison.study import Study
 from comparison.tables import markdown, seconds_per_step, steps_to, steps_to_own, threshold
-from comparison.verdicts import Judgement, joined, more, no_gain, pair, verdict
+from comparison.verdicts import Claims, Judgement, joined, more, no_gain, pair, verdict
 
 TASK = "cartpole"
 # A goal that is solved by swinging the long way round costs about 2; half of it tells the two ways apart.
@@ -20,32 +18,12 @@ SWING = 1.0
 NO_DIFFERENCE = {"return": 0.1, "steps": 0.3}  # margins, in return and in million steps
 WEIGHTS = ("loss-0.1", "loss-1", "loss-10")
 
-CLAIMS: list["Claim"] = []
-
+claim = CLAIMS = Claims()
 
 returns, variations, symmetry_loss, steps = (
     partial(what, task=TASK)
     for what in (verdicts.returns, verdicts.variations, verdicts.symmetry_loss, verdicts.steps)
 )
-
-
-@dataclass(frozen=True)
-class Claim:
-    """What the paper says, where, and how it is judged here."""
-
-    text: str
-    place: str
-    judge: Callable[[Study], Judgement]
-
-
-def claim(text: str, place: str) -> Callable[[Callable[[Study], Judgement]], Callable[[Study], Judgement]]:
-    """Register a judge where it is defined."""
-
-    def register(judge: Callable[[Study], Judgement]) -> Callable[[Study], Judgement]:
-        CLAIMS.append(Claim(text, place, judge))
-        return judge
-
-    return register
 
 
 def own_steps(study: Study, method: str) -> np.ndarray:
@@ -205,8 +183,4 @@ def _random(study: Study) -> Judgement:
 
 def table(study: Study) -> str:
     """All claims with evidence and verdict, as Markdown."""
-    rows = [["claim", "place", "evidence here", "verdict"], ["---"] * 4]
-    for each in CLAIMS:
-        evidence, outcome = each.judge(study)
-        rows.append([each.text, each.place, evidence, f"**{outcome}**"])
-    return markdown(rows)
+    return markdown([*CLAIMS.HEAD, *(each.row(each.judge(study)) for each in CLAIMS)])

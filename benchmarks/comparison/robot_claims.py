@@ -16,6 +16,7 @@ from comparison.methods import label, parts
 from comparison.study import Study
 from comparison.tables import markdown, measured, seconds_per_step
 from comparison.verdicts import (
+    Claims,
     Judgement,
     joined,
     no_gain,
@@ -31,7 +32,7 @@ from comparison.verdicts import (
 FIGURES = {"return": "return", "task_return": "task return", "success": "success"}
 NO_DIFFERENCE = 0.05  # of the return of augmentation: what a mirror loss beside it may add
 
-CLAIMS: list["RobotClaim"] = []
+claim = CLAIMS = Claims()
 
 
 @dataclass(frozen=True)
@@ -60,27 +61,6 @@ class Results:
         """The method with augmentation and a mirror loss, if there is one."""
         found = [m for m in self.study.methods(self.task) if parts(m)[0] == "aug" and parts(m)[1]]
         return next((m for m in found if self.seeds(m) > 1), None)
-
-
-@dataclass(frozen=True)
-class RobotClaim:
-    """What the paper says, where, how it is judged, and what has to be there for it."""
-
-    text: str
-    place: str
-    judge: Callable[[Results], Judgement | None]
-    methods: tuple[str, ...]
-    figure: str
-
-
-def claim(text: str, place: str, *methods: str, figure: str = "return"):
-    """Register a judge where it is defined."""
-
-    def register(judge: Callable[[Results], Judgement | None]):
-        CLAIMS.append(RobotClaim(text, place, judge, methods, figure))
-        return judge
-
-    return register
 
 
 def figures(results: Results) -> dict[str, str]:
@@ -187,7 +167,7 @@ def table(study: Study, task: str, what: str | None = None) -> str:
         task: one of its tasks.
         what: one of the task's evaluations; the first by default.
     """
-    rows = [["claim", "place", "evidence here", "verdict"], ["---"] * 4]
+    rows = [*CLAIMS.HEAD]
     results = Results(study, task, what or study.evaluations(task)[0])
     for each in CLAIMS:
         if not set(each.methods) <= set(study.methods(task)):
@@ -200,5 +180,5 @@ def table(study: Study, task: str, what: str | None = None) -> str:
             continue
         judgement = each.judge(results)
         if judgement is not None:
-            rows.append([each.text, each.place, judgement[0], f"**{judgement[1]}**"])
+            rows.append(each.row(judgement))
     return markdown(rows)

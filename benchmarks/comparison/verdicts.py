@@ -8,6 +8,8 @@ is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -18,6 +20,36 @@ from comparison.study import LAST_PHASE, Study
 from comparison.tables import SHARE, SMOOTHING, smooth, steps_to, threshold, variation
 
 Judgement = tuple[str, str]  # evidence, verdict
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What the paper says, where, how it is judged here, and what has to be there for it."""
+
+    text: str
+    place: str
+    judge: Callable[[Any], Any]  # Judgement, or None where there is nothing to judge
+    methods: tuple[str, ...] = ()
+    figure: str = "return"
+
+    def row(self, judgement: Judgement) -> list[str]:
+        """Its row in a table."""
+        return [self.text, self.place, judgement[0], f"**{judgement[1]}**"]
+
+
+class Claims(list[Claim]):
+    """Claims in the order of their judges; called with a claim, it decorates the judge."""
+
+    HEAD = (["claim", "place", "evidence here", "verdict"], ["---"] * 4)
+
+    def __call__(self, text: str, place: str, *methods: str, figure: str = "return"):
+        """Register a judge where it is defined."""
+
+        def register(judge: Callable[[Any], Any]):
+            self.append(Claim(text, place, judge, methods, figure))
+            return judge
+
+        return register
 
 
 def returns(study: Study, method: str, *, task: str, **which: str | None) -> np.ndarray:
