@@ -36,12 +36,13 @@ BASE_HEIGHT, LOWEST = 0.5, 0.2  # asked for over the ground, and counted as fall
 FALL_PENALTY = 5.0
 # The grid of the height map: 21 x 11 points, 0.1 m apart, that turn with the robot's heading.
 ROWS, COLUMNS, SPACING = 21, 11, 0.1
-HEIGHT_SCALE = 2.0  # what heights, m, are multiplied by
+# What heights (legged_gym) and the target's position, m, are multiplied by.
+HEIGHT_SCALE, TARGET_SCALE = 5.0, 3.0
 # A phase is over at this success rate and, for A, at this mean level.
-PHASE_SUCCESS, PHASE_LEVEL = 0.7, 3.0
-TASK_WEIGHTS = {"position": 10.0, "heading": 2.0}
+PHASE_SUCCESS, PHASE_LEVEL = 0.7, 5.0
+TASK_WEIGHTS = {"position": 20.0, "heading": 4.0}
 BIAS_WEIGHTS = {"velocity": 4.0}
-GAIT_WEIGHTS = {"alive": 0.5, "height": -10.0, "vertical": -0.5, "rolling": -0.05, "tilt": -0.5}
+GAIT_WEIGHTS = {"alive": 0.5, "height": -40.0, "vertical": -0.5, "rolling": -0.05, "tilt": -2.0}
 HEADING_WEIGHTS = {"turned": -0.3}
 EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.005}
 Phase = Literal["A", "B", "C"]
@@ -76,13 +77,13 @@ class AnymalClimb(Anymal):
 
     name = "anymal_climb"
     asset = "anymal_climb.xml"
-    episode_seconds = 8.0
+    episode_seconds = 6.0
     observation_size = 282
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(
-        self, *, height: float = 0.2, phase: Phase = "A", curriculum: bool = True, **robot: Any
+        self, *, height: float = 0.3, phase: Phase = "A", curriculum: bool = True, **robot: Any
     ) -> None:
         if phase not in ("A", "B", "C") or not LOWEST_BOX <= height < math.inf:
             raise ValueError(
@@ -101,7 +102,7 @@ class AnymalClimb(Anymal):
         group = self.robot.group
         return (
             *self.proprioception(),
-            Entry("target position", polar(group), "m", "base", "polar vector"),
+            Entry("target position", polar(group), "m", "base", "polar vector", TARGET_SCALE),
             Entry("heading error (cos, sin)", heading(group), "1", "base", "sine changes sign in a mirror"),
             Entry("time left", invariant(group, 1), "1", "-", "invariant"),
             Entry(
@@ -220,7 +221,7 @@ class AnymalClimb(Anymal):
         """Proprioception, command, and the heights below a standing robot's base."""
         observation = torch.empty(len(state), 282)
         self.observe_robot(state, observation)
-        observation[:, 45:48] = into_base(rotation(state), self._gap(state))
+        observation[:, 45:48] = into_base(rotation(state), self._gap(state)) * TARGET_SCALE
         observation[:, 48:50] = self._heading_error(state)
         observation[:, 50] = 1 - state.time / self.episode_seconds
         observation[:, :51].clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)

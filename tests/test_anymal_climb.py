@@ -15,6 +15,7 @@ from tasks.anymal_climb import (
     BOX,
     COLUMNS,
     FALL_PENALTY,
+    HEIGHT_SCALE,
     ROWS,
     SPEED,
     TASK_WEIGHTS,
@@ -46,7 +47,7 @@ def test_the_canonical_goal_is_in_front_on_the_left_and_every_other_where_its_na
     box = state.mocap_pos[:, 0]
     assert box[:, 0].min() >= 1.7 and box[:, 0].max() <= 2.0
     assert box[:, 1].min() >= 0.0 and box[:, 1].max() <= 0.3
-    torch.testing.assert_close(box[:, 2] + BOX, torch.full((300,), 0.2, dtype=torch.float64))
+    torch.testing.assert_close(box[:, 2] + BOX, torch.full((300,), 0.3, dtype=torch.float64))
     for g, name in enumerate(task.goal_names):
         x, y = task.transform_state(state, g).mocap_pos[:, 0, :2].unbind(-1)
         assert ((x > 0) == name.startswith("front")).all()
@@ -107,15 +108,15 @@ def test_observed_heights_are_relative_to_a_standing_robot_and_limited():
     state = around_the_box(task, 8)
     state.qpos[:, 2] = torch.tensor([0.5, 0.5, 0.5, 0.5, 0.8, 0.8, 5.0, 5.0])
     seen = task.observe(state)[:, 51:].double()
-    expected = (task.heights(state).double() - (state.qpos[:, 2:3] - 0.5)).clamp(-1, 1) * 2
+    expected = (task.heights(state).double() - (state.qpos[:, 2:3] - 0.5)).clamp(-1, 1) * HEIGHT_SCALE
     torch.testing.assert_close(seen, expected, rtol=0, atol=1e-6)
-    assert (seen[-1] == -2.0).all()
+    assert (seen[-1] == -HEIGHT_SCALE).all()
 
 
 def test_time_left_runs_from_one_to_zero_and_ends_the_episode():
     task = AnymalClimb()
     state = task.sample_goal_state(3, torch.Generator().manual_seed(0))
-    state.time[:] = torch.tensor([0.0, 4.0, 8.0])
+    state.time[:] = torch.tensor([0.0, 3.0, 6.0])
     assert task.observe(state)[:, 50].tolist() == [1.0, 0.5, 0.0]
     assert task.terminated(state).tolist() == [False, False, True]
 
@@ -152,7 +153,7 @@ def test_the_position_pays_only_in_the_last_two_seconds():
     task = AnymalClimb()
     state = task.sample_goal_state(4, torch.Generator().manual_seed(0))
     state.qpos[:, 0:3] = state.mocap_pos[:, 1]
-    state.time[:] = torch.tensor([0.02, 6.0, 6.02, 8.0])
+    state.time[:] = torch.tensor([0.02, 4.0, 4.02, 6.0])
     terms = task.reward_terms(state, zeros(state))
     paid = 0.02 * TASK_WEIGHTS["position"] / 2.0
     expected = torch.tensor([0.0, 0.0, paid, paid], dtype=torch.float64)
