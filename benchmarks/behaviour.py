@@ -4,7 +4,8 @@
 
 * `TASK_paths`: robot and object from above, as run and mapped back onto one goal (the paper's figure of
   ANYmal-Push): what is symmetric leaves a single bundle of paths there.
-* `TASK_touches`: which limbs touch the object, goal by goal.
+* `TASK_touches`: which limbs touch the cube, goal by goal (ANYmal-Push).
+* `TASK_heights`: on how high a box it climbs, forward and backward (ANYmal-Climb).
 * `TASK_frames`: key frames of the first two goals, a row per method and goal.
 
 Episodes are paired: every goal starts from the image of the same states. Drawn for the best seed of each
@@ -29,6 +30,7 @@ from comparison.methods import label
 from tasks.anymal import LEGS
 from tasks.base import Task, create
 from tasks.environment import BatchedEnv
+from tasks.evaluation import evaluate
 from tasks.rendering import draw_paths, record, render, save, sheet
 from tasks.state import State
 from torchrl_sym.recipes import load_actor
@@ -36,6 +38,7 @@ from torchrl_sym.recipes import load_actor
 HERE = Path(__file__).parent
 SEED = 2000  # of starts: not those of the evaluation
 FRAMES = 5  # key frames of an episode
+BOX_HEIGHTS = tuple(0.05 * i for i in range(2, 11))  # m
 LIMBS = (*LEGS, "head", "tail")  # the last two are the front and the back half of the trunk
 
 
@@ -50,7 +53,7 @@ class Arguments:
     episodes: int = 6
     """Per goal, in the figures of paths."""
     touching: int = 50
-    """Episodes per goal, in the figures of limbs."""
+    """Episodes per goal, in the figures of limbs and of heights."""
     seconds: float | None = None
     """Length of the episodes; the task's own when left out."""
     results: Path = HERE / "results"
@@ -155,6 +158,30 @@ def draw_touches(shares: dict[str, np.ndarray], goals: tuple[str, ...], body: st
     return figure
 
 
+def climbed(checkpoint: Path, episodes: int, seconds: float | None) -> np.ndarray:
+    """Success on boxes of every height, facing them, ``(heights, goals)``."""
+    rates = []
+    for height in BOX_HEIGHTS:
+        env = BatchedEnv(create("anymal_climb", height=height, episode_seconds=seconds), 1, num_threads=1)
+        outcome = evaluate(env, load_actor(checkpoint, env, env.symmetry), episodes, SEED, num_threads=1)
+        rates.append(list(outcome.goal_successes.values()))
+    return np.array(rates)
+
+
+def draw_heights(rates: dict[str, np.ndarray], goals: tuple[str, ...]):
+    """Success over the height of the box: a colour per method, dashed for backward."""
+    figure, axis = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
+    front = np.array([goal.startswith("front") for goal in goals])
+    for number, (method, rate) in enumerate(rates.items()):
+        for name, chosen, line in (("forward", front, "o-"), ("backward", ~front, "s--")):
+            values = rate[:, chosen].mean(axis=1)
+            axis.plot(BOX_HEIGHTS, values, line, color=f"C{number}", label=f"{label(method)}, {name}", ms=4)
+    axis.set(xlabel="height of the box [m]", ylabel="success", ylim=(-0.03, 1.03))
+    axis.grid(alpha=0.3)
+    axis.legend(frameon=False, fontsize=8)
+    return figure
+
+
 def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarray:
     """Key frames of the first episode of some goals, a row per method and goal."""
     rows, captions = [], []
@@ -186,14 +213,18 @@ def main(arguments: Arguments) -> None:
         if not kept:
             print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
             continue
-        pushing = name == "anymal_push"
+        pushing, climbing = name == "anymal_push", name == "anymal_climb"
         played = max(arguments.episodes, arguments.touching * pushing)
         recordings = {m: play(task, folder, played) for m, folder in kept.items()}
-        drawn = {}
+        drawn = {"paths": paths({m: each.first(arguments.episodes) for m, each in recordings.items()})}
         if pushing:
-            drawn["paths"] = paths({m: each.first(arguments.episodes) for m, each in recordings.items()})
             shares = {m: touches(recording, "cube") for m, recording in recordings.items()}
             drawn["touches"] = draw_touches(shares, task.goal_names, "cube")
+        if climbing:
+            many = arguments.touching, arguments.seconds
+            drawn["heights"] = draw_heights(
+                {m: climbed(folder, *many) for m, folder in kept.items()}, task.goal_names
+            )
         for kind, figure in drawn.items():
             figure.savefig(plots / f"{name}_{kind}.png", dpi=110)
             plt.close(figure)

@@ -34,10 +34,12 @@ CAPTIONS = {
 }
 
 ROBOT_CAPTIONS = {
-    "paths": "The best seed's policy: robot (solid) and cube (dashed) from above, equivalent goals in "
-    "colours; on the right all mapped back onto one goal (the paper's figure of observed trajectories).",
+    "paths": "The best seed's policy from above: what moves freely (robot solid, its object dashed), "
+    "equivalent goals in colours; on the right all mapped back onto one goal (the paper's figure of "
+    "observed trajectories).",
     "touches": "The best seed's policy: share of the time in contact with the cube that each limb has a "
     "part in, goal by goal.",
+    "heights": "The best seed's policy: success over the height of the box, facing it.",
     "frames": "Key frames of two equivalent goals, the best seed's policy of each method.",
     "training": "Training return and symmetry loss.",
     "success": "Success in training and the level of the curriculum.",

@@ -71,21 +71,6 @@ def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     assert picture.stat().st_size > 10_000
 
 
-def test_learn_evaluates_and_draws_a_robot_task(tmp_path):
-    tiny = ["--iterations", "2", "--num-envs", "8", "--episodes", "1"]
-    folders = ["--folder", tmp_path / "runs", "--output", tmp_path / "results"]
-    run("benchmarks/learn.py", "anymal_climb", *tiny, *folders)
-    results = tmp_path / "results" / "anymal_climb"
-    figures = json.loads((results / "result.json").read_text())
-    assert set(figures["evaluation"]) == {"facing the box", "any heading"}
-    goals = figures["evaluation"]["any heading"]["sampled"]["goal_successes"]
-    assert list(goals) == ["front left", "back left", "front right", "back right"]
-    (results / "curve.png").unlink()
-    run("benchmarks/learn.py", "anymal_climb", "--plot", *folders)
-    assert (results / "curve.png").stat().st_size > 10_000
-    assert "| anymal_climb | any heading |" in (tmp_path / "results" / "README.md").read_text()
-
-
 @pytest.mark.parametrize("suffix", ["png", "gif"])
 def test_watch_draws_every_goal(tmp_path, suffix):
     picture = tmp_path / f"watch.{suffix}"
