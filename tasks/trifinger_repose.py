@@ -37,8 +37,8 @@ CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
 # Share of that radius which starts and goals are drawn from at the first level; it grows to 1 at the last.
 FIRST_SHARE, LAST_LEVEL = 0.4, 7
-# An episode that ends farther from its goal, m, lowers the level.
-FAILURE_DISTANCE = 0.06
+# An episode that ends farther from its goal, m, or turned farther from it, rad, lowers the level.
+FAILURE_DISTANCE, FAILURE_ANGLE = 0.06, 0.8
 LIFT, HIGHEST = 0.0825, 0.1  # goal of difficulty 2 and highest goal of 3 and 4, m
 # Success: position error, m, at difficulty 1 and above; orientation error, rad, where the goal has one.
 PLANAR_DISTANCE, SUCCESS_DISTANCE, SUCCESS_ANGLE = 0.03, 0.02, 0.4
@@ -177,12 +177,14 @@ class TrifingerRepose(Task):
         whole |= self.terminated(finished)
         success, error = whole & self.success(finished), self.position_error(finished)
         ended = {"success": success, "error": error, "level": level}
+        far = error > FAILURE_DISTANCE
         if self.oriented:
             ended["angle"] = self.orientation_error(finished)
+            far |= ended["angle"] > FAILURE_ANGLE
         self.averages.update(**{name: figure[whole] for name, figure in ended.items()})
         if not self.curriculum:
             return self.sample_initial_state(len(finished), generator)
-        failure = whole & ~success & (error > FAILURE_DISTANCE)
+        failure = whole & ~success & far
         level = next_level(level, success, failure, LAST_LEVEL, generator)
         return self.mapped_at_random(self._start(level, generator), generator)
 

@@ -1,5 +1,7 @@
 """Trifinger-Repose: exact symmetry, the model's numbers, starts without contact, reward, safety."""
 
+import math
+
 import mujoco
 import numpy as np
 import pytest
@@ -301,6 +303,12 @@ def test_success_moves_starts_outwards_and_failure_inwards():
     assert (task.restart(state, generator()).variables["level"] == 3.0).all()
 
 
+def turned_about_the_vertical(quaternion, angle):
+    w, x, y, z = quaternion.unbind(-1)
+    cos, sin = math.cos(angle / 2), math.sin(angle / 2)
+    return torch.stack([cos * w - sin * z, cos * x - sin * y, cos * y + sin * x, cos * z + sin * w], dim=-1)
+
+
 def test_a_goal_on_the_table_can_have_a_heading():
     task = TrifingerRepose(yaw=1.0)
     state = task.sample_goal_state(2000, generator())
@@ -314,6 +322,11 @@ def test_a_goal_on_the_table_can_have_a_heading():
     assert float((state.qpos[:, 12:16] * state.mocap_quat[:, 0]).sum(-1).min()) > 0, "signs agree"
     state.qpos[:, 9:12] = state.mocap_pos[:, 0]
     assert (task.success(state) == (error < 0.4)).all()
+    state.mocap_quat[:] = state.qpos[:, None, 12:16]
+    state.mocap_quat[1000:, 0] = turned_about_the_vertical(state.qpos[1000:, 12:16], 1.2)
+    state.variables["level"][:], state.time[:] = 3.0, 5.0
+    after = task.restart(state, generator()).variables["level"][:, 0]
+    assert after.tolist() == [4.0] * 1000 + [2.0] * 1000
     assert set(task.metrics()) == {"success", "error", "level", "angle"}
 
 
