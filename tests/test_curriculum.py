@@ -183,9 +183,9 @@ def test_phases_follow_each_other_as_climbing_succeeds():
         unstarted = task.sample_initial_state(4, generator())
         return task.restart(unstarted, generator()), task.phase
 
-    assert after(0.9, 2.9)[1] == "A", "the boxes are still low"
-    assert after(0.69, 5.0)[1] == "A"
-    assert after(0.71, 3.1)[1] == "B"
+    assert after(0.9, 4.9)[1] == "A", "the boxes are still low"
+    assert after(0.69, 6.0)[1] == "A"
+    assert after(0.71, 5.1)[1] == "B"
     assert task.metrics()["success"] == 0.0, "the next phase is judged by its own episodes"
     start, phase = after(0.5, 8.0)
     assert phase == "B" and not start.qpos[:, 4:6].any()
