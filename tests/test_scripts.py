@@ -109,11 +109,15 @@ def test_figures_and_pages_follow_from_the_stored_results(tmp_path):
     assert readme.read_text() == (ROOT / "README.md").read_text(), advice
 
 
-def test_what_policies_do_is_drawn_from_the_stored_ones(tmp_path):
-    short = ["--episodes", "1", "--touching", "1", "--seconds", "0.2"]
-    run("benchmarks/behaviour.py", "paper-push", "--plots", tmp_path, *short)
-    drawn = {path.name for path in (tmp_path / "paper-push").iterdir()}
-    assert drawn == {f"anymal_push_{kind}.png" for kind in ("paths", "touches", "frames")}
+@pytest.mark.parametrize(
+    ("name", "task", "kind"),
+    [("paper-push", "anymal_push", "touches"), ("paper-climb", "anymal_climb", "heights")],
+)
+def test_what_policies_do_is_drawn_from_the_stored_ones(tmp_path, name, task, kind):
+    short = ["--episodes", "1", "--touching", "1", "--seconds", "0.1"]
+    run("benchmarks/behaviour.py", name, "--plots", tmp_path, *short)
+    drawn = {path.name for path in (tmp_path / name).iterdir()}
+    assert drawn == {f"{task}_{what}.png" for what in ("paths", kind, "frames")}
 
 
 @pytest.mark.slow
