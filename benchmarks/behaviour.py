@@ -27,6 +27,7 @@ import torch
 import tyro
 
 from comparison.methods import label
+from plot import color
 from tasks.anymal import LEGS
 from tasks.base import Task, create
 from tasks.environment import BatchedEnv
@@ -172,10 +173,11 @@ def draw_heights(rates: dict[str, np.ndarray], goals: tuple[str, ...]):
     """Success over the height of the box: a colour per method, dashed for backward."""
     figure, axis = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
     front = np.array([goal.startswith("front") for goal in goals])
-    for number, (method, rate) in enumerate(rates.items()):
+    for method, rate in rates.items():
         for name, chosen, line in (("forward", front, "o-"), ("backward", ~front, "s--")):
             values = rate[:, chosen].mean(axis=1)
-            axis.plot(BOX_HEIGHTS, values, line, color=f"C{number}", label=f"{label(method)}, {name}", ms=4)
+            style = {"color": color(method), "label": f"{label(method)}, {name}", "markersize": 4}
+            axis.plot(BOX_HEIGHTS, values, line, **style)
     axis.set(xlabel="height of the box [m]", ylabel="success", ylim=(-0.03, 1.03))
     axis.grid(alpha=0.3)
     axis.legend(frameon=False, fontsize=8)
