@@ -15,11 +15,12 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check -c constraints
 export OMP_NUM_THREADS ?= 1
 export MPLBACKEND ?= Agg
 
-.PHONY: help quickstart test check build clean
+.PHONY: help quickstart films test check build clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make quickstart   train PPO with and without symmetry on CartPole; watch ANYmal push a cube"
+	@echo "make films        the films of benchmarks/plots, from the policies of benchmarks/results"
 	@echo "make test         run all tests and doctests"
 	@echo "make check        lint, formatting, types"
 	@echo "make build        wheel and sdist in dist/; the wheel is smoke-tested in a clean environment"
@@ -38,6 +39,15 @@ quickstart: $(INSTALLED)
 	$(BIN)/python examples/quickstart.py
 	$(BIN)/python examples/watch.py $(PUSH) --out runs/quickstart/push.png || \
 	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png
+
+# All goals side by side from the images of one start, a minute each.
+define film
+$(BIN)/python examples/watch.py anymal_$(1) --checkpoint benchmarks/results/paper-$(1)/policies/anymal_$(1)/$(2) \
+  --out benchmarks/plots/paper-$(1)/anymal_$(1)_$(2).mp4
+
+endef
+films: $(INSTALLED)
+	$(foreach task,push climb,$(foreach method,ppo aug,$(call film,$(task),$(method))))
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(PYTEST_ARGS)

@@ -27,6 +27,8 @@ import torch
 import tyro
 
 from comparison.methods import label
+from comparison.run import environment, task_setting
+from comparison.study import policy_folder, read
 from plot import color
 from tasks.anymal import LEGS
 from tasks.base import Task, create
@@ -83,6 +85,12 @@ class Recording:
         rows = [g * each + k for g in range(len(self.elements) // each) for k in range(episodes)]
         states = [state.rows(torch.tensor(rows)) for state in self.states]
         return Recording(self.task, states, [self.elements[row] for row in rows])
+
+
+def evaluated(name: str, seconds: float | None) -> Task:
+    """A task as its first evaluation has it."""
+    how = next(iter(task_setting(name).evaluations.values()))
+    return environment(name)(num_envs=1, seed=0, episode_seconds=seconds, **how).task
 
 
 def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
@@ -203,15 +211,15 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
 
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    checkpoints = arguments.results / arguments.name / "policies"
-    if not checkpoints.is_dir():
-        raise SystemExit(f"expected policies in {checkpoints}, found none; run compare.py on a robot task")
+    results = arguments.results / arguments.name
+    if not (results / "policies").is_dir():
+        raise SystemExit(f"expected policies in {results}, found none; run compare.py on a robot task")
     plots = arguments.plots / arguments.name
     plots.mkdir(parents=True, exist_ok=True)
-    found = sorted(path.name for path in checkpoints.iterdir())
-    for name in found:
-        task = create(name, episode_seconds=arguments.seconds)
-        kept = {m: checkpoints / name / m for m in arguments.methods if (checkpoints / name / m).exists()}
+    for name in read(results).tasks:
+        task = evaluated(name, arguments.seconds)
+        folder = policy_folder(results, name)
+        kept = {m: folder / m for m in arguments.methods if (folder / m).exists()}
         if not kept:
             print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
             continue
@@ -228,9 +236,9 @@ def main(arguments: Arguments) -> None:
                 {m: climbed(folder, *many) for m, folder in kept.items()}, task.goal_names
             )
         for kind, figure in drawn.items():
-            figure.savefig(plots / f"{name}_{kind}.png", dpi=110)
+            figure.savefig(plots / f"{folder.name}_{kind}.png", dpi=110)
             plt.close(figure)
-        save(plots / f"{name}_frames.png", [frames(recordings, (0, 1))])
+        save(plots / f"{folder.name}_frames.png", [frames(recordings, (0, 1))])
         print(f"drew {name}: {', '.join([*drawn, 'frames'])}")
 
 

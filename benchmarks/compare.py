@@ -75,6 +75,7 @@ def _robot(task: str, seeds: int) -> tuple[Experiment, ...]:
 
 
 _PUSH, _CLIMB, _REPOSE = _robot("anymal_push", 5), _robot("anymal_climb", 3), _robot("trifinger_repose", 3)
+_REPOSE_YAW = (Experiment(("repose_yaw:make_env",), ("ppo", "aug"), 3),)
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
     "smoke": (
@@ -87,7 +88,8 @@ PRESETS: dict[str, tuple[Experiment, ...]] = {
     "paper-push": _PUSH,
     "paper-climb": _CLIMB,
     "paper-repose": _REPOSE,
-    "paper": (_CARTPOLE, *_MORE_SEEDS, *_PUSH, *_CLIMB, *_REPOSE),
+    "paper-repose-yaw": _REPOSE_YAW,
+    "paper": (_CARTPOLE, *_MORE_SEEDS, *_PUSH, *_CLIMB, *_REPOSE, *_REPOSE_YAW),
 }
 
 

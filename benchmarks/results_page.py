@@ -19,8 +19,13 @@ from comparison.tables import efficiency_table, table_1
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
-ROBOTS = {"paper-push": "anymal_push", "paper-climb": "anymal_climb", "paper-repose": "trifinger_repose"}
-"""Studies of robots, and their tasks; those that have no results yet are left out."""
+ROBOTS = {
+    "paper-push": "ANYmal-Push",
+    "paper-climb": "ANYmal-Climb",
+    "paper-repose": "Trifinger-Repose: place",
+    "paper-repose-yaw": "Trifinger-Repose: place and heading",
+}
+"""Studies of one robot task each, and their titles; those that have no results yet are left out."""
 FEW = 5  # seeds, below which verdicts are too easy
 README_METHODS = ["ppo", "loss-0.1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {
@@ -126,7 +131,7 @@ Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
 
 def robot_section(name: str, study: Study) -> str:
     """What the paper claims of a robot task and what was found, with figures and costs."""
-    task, about = ROBOTS[name], study.about
+    task, about = study.tasks[0], study.about
     hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
     seeds = min(len(study.seeds(task, method)) for method in ("ppo", "aug"))
@@ -146,7 +151,7 @@ def robot_section(name: str, study: Study) -> str:
         for what in study.evaluations(task)
     )
     return f"""
-## {task}
+## {ROBOTS[name]}
 
 {made}
 

@@ -6,8 +6,8 @@ Episodes are paired: every goal starts from the image of one and the same state.
 actions are random and mirrored too, so the pictures are exact mirror images: the symmetry of the task.
 With one, differences are the policy's own.
 
-The suffix of --out decides: .gif or .mp4 (pip install imageio-ffmpeg) a film with all goals side by side,
-.png a strip of key frames, one row per goal. With --overlay, a .png of all paths from above instead.
+The suffix of --out decides: .gif or .mp4 (pip install 'torchrl_sym[video]') a film, goals side by
+side, .png a strip of key frames, one row per goal. With --overlay, a .png of all paths from above instead.
 """
 
 import os

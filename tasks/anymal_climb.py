@@ -277,7 +277,8 @@ class AnymalClimb(Anymal):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.phase, self.averages.values = saved["phase"], dict(saved["averages"])
+        self.phase = saved["phase"]
+        self.averages.load(saved["averages"])
 
 
 def _axes() -> tuple[Tensor, Tensor]:

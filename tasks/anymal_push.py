@@ -227,7 +227,7 @@ class AnymalPush(Anymal):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.values = dict(saved["averages"])
+        self.averages.load(saved["averages"])
 
 
 def facing(turn: Tensor, toward: Tensor) -> Tensor:

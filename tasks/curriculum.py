@@ -59,3 +59,7 @@ class Averages:
             mean, old = float(figures.double().mean()), self.values[name]
             share = 1.0 if math.isnan(old) else 1 - (1 - EPISODE_WEIGHT) ** len(figures)
             self.values[name] = mean if math.isnan(old) else old + share * (mean - old)
+
+    def load(self, values: dict[str, float]) -> None:
+        """Continue from ``values``; what another version of the task did not average begins anew."""
+        self.values = {name: values.get(name, math.nan) for name in self.values}

@@ -348,7 +348,7 @@ class TrifingerRepose(Task):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.values = dict(saved)
+        self.averages.load(saved)
 
 
 def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from tasks.anymal_push import LAST_LEVEL as LAST_TARGET
 from tasks.anymal_push import AnymalPush
 from tasks.curriculum import EPISODE_WEIGHT, Averages, next_level
 from tasks.environment import BatchedEnv
+from tasks.trifinger_repose import TrifingerRepose
 from tests.task_helpers import actions, assert_same, make, play
 
 
@@ -54,6 +55,16 @@ def test_averages_start_with_the_first_episodes_and_remember_about_500():
     for _ in range(500):
         apart.update(x=torch.zeros(1))
     assert together.values["x"] == pytest.approx(apart.values["x"]) == pytest.approx(1 / math.e, abs=0.01)
+
+
+def test_averages_of_another_version_of_a_task_are_kept_where_this_one_has_them():
+    plain, oriented = TrifingerRepose(), TrifingerRepose(yaw=math.pi)
+    plain.averages.update(success=torch.ones(1), error=torch.ones(1), level=torch.ones(1))
+    oriented.load_state_dict(plain.state_dict())
+    assert oriented.metrics()["success"] == 1.0 and math.isnan(oriented.metrics()["angle"])
+    oriented.averages.update(angle=torch.ones(1))
+    plain.load_state_dict(oriented.state_dict())
+    assert plain.metrics() == {"success": 1.0, "error": 1.0, "level": 1.0}
 
 
 def finished_pushes(task):

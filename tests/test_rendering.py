@@ -3,6 +3,7 @@
 import os
 import sys
 
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -102,8 +103,12 @@ def test_save(tmp_path, monkeypatch):
         ValueError, match=r"expected a file name that ends in .png, .gif or .mp4, got 'a.avi'"
     ):
         save(tmp_path / "a.avi", frames)
+    save(tmp_path / "film.mp4", frames, fps=10)
+    read = imageio_ffmpeg.read_frames(str(tmp_path / "film.mp4"))
+    about = next(read)
+    assert (about["size"], about["fps"], len(list(read))) == ((32, 24), 10.0, 3)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match="pip install imageio imageio-ffmpeg"):
+    with pytest.raises(ImportError, match=r"pip install 'torchrl_sym\[video\]'"):
         save(tmp_path / "film.mp4", frames)
 
 

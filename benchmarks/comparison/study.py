@@ -76,7 +76,7 @@ def write(
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
-        export_actor(stage_folders(run.folder)[-1], folder / "policies" / run.task / run.method)
+        export_actor(stage_folders(run.folder)[-1], policy_folder(folder, run.task) / run.method)
     first = (*RUN, "outcome", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
@@ -84,6 +84,11 @@ def write(
     about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
     about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
     write_json(folder / "study.json", about)
+
+
+def policy_folder(folder: Path, task: str) -> Path:
+    """Where the results in a folder keep the policies of a task."""
+    return folder / "policies" / task.replace(":", ".")
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:

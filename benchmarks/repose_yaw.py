@@ -1,0 +1,32 @@
+"""Trifinger-Repose with a heading: bring the cube to a place on the table, turned as the goal is.
+
+    python benchmarks/compare.py --preset paper-repose-yaw
+
+The difficulty after `trifinger_repose`, which it begins with: a policy that can move the cube learns to
+turn it. It is given to `compare.py` as any task of one's own, by a module with `make_env` and `SETTING`.
+"""
+
+import dataclasses
+import functools
+import math
+
+import tasks
+from tasks.settings import SETTINGS, Setting
+
+make_env = functools.partial(tasks.make_env, "trifinger_repose", num_threads=1)
+
+_PLACES = SETTINGS["trifinger_repose"]
+_STEADY = _PLACES.then[0]
+_HEADING = {"yaw": math.pi}  # at the last level; an eighth of it at the first
+
+SETTING = Setting(
+    _PLACES.config,
+    _PLACES.task,
+    evaluations={"place and heading": _HEADING},
+    then=(
+        Setting(
+            dataclasses.replace(_PLACES.config, iterations=800), _PLACES.task | _HEADING
+        ),  # 6.6 M steps
+        Setting(dataclasses.replace(_STEADY.config, iterations=200), _STEADY.task | _HEADING),  # 1.6 M
+    ),
+)
