@@ -20,12 +20,12 @@ from comparison.tables import efficiency_table, table_1
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
 ROBOTS = {
-    "paper-push": "ANYmal-Push",
-    "paper-climb": "ANYmal-Climb",
-    "paper-repose": "Trifinger-Repose: place",
-    "paper-repose-yaw": "Trifinger-Repose: place and heading",
+    "paper-push": ("anymal_push", "ANYmal-Push"),
+    "paper-climb": ("anymal_climb", "ANYmal-Climb"),
+    "paper-repose": ("trifinger_repose", "Trifinger-Repose: place"),
+    "paper-repose-yaw": ("repose_yaw:make_env", "Trifinger-Repose: place and heading"),
 }
-"""Studies of one robot task each, and their titles; those that have no results yet are left out."""
+"""Studies of robots, their tasks and titles; those that have no results yet are left out."""
 FEW = 5  # seeds, below which verdicts are too easy
 README_METHODS = ["ppo", "loss-0.1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {
@@ -131,7 +131,7 @@ Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
 
 def robot_section(name: str, study: Study) -> str:
     """What the paper claims of a robot task and what was found, with figures and costs."""
-    task, about = study.tasks[0], study.about
+    (task, title), about = ROBOTS[name], study.about
     hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
     seeds = min(len(study.seeds(task, method)) for method in ("ppo", "aug"))
@@ -151,7 +151,7 @@ def robot_section(name: str, study: Study) -> str:
         for what in study.evaluations(task)
     )
     return f"""
-## {ROBOTS[name]}
+## {title}
 
 {made}
 

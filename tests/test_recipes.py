@@ -121,6 +121,18 @@ def test_a_run_starts_from_another_one(symmetry, tmp_path):
         list(train(TINY, MAKE_ENV, symmetry, start_from=tmp_path / "nothing"))
 
 
+def test_episodes_go_on_where_a_run_starts_from_another_one(symmetry, tmp_path):
+    first, second = tmp_path / "first", tmp_path / "second"
+    whole = dataclasses.replace(TINY, horizon=410, iterations=1, epochs=1)  # an episode has 200 steps
+    list(train(whole, MAKE_ENV, symmetry, folder=first))
+    short = dataclasses.replace(whole, horizon=4)
+    (row,) = train(short, MAKE_ENV, symmetry, folder=second, start_from=first)
+    old, new = (RunFolder(folder).load()["episodes"] for folder in (first, second))
+    assert old["whole"].all() and new["whole"].all()
+    assert (new["running"] != 0).all() and (new["running"] - old["running"]).abs().max() < 4.0
+    assert row["return"] == old["latest"], "no episode ended"
+
+
 SCRIPT = """
 import functools, sys, torch
 torch.set_num_threads(1)

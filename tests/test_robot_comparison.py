@@ -118,6 +118,20 @@ def test_progress_in_a_curriculum_is_the_level_that_is_mastered_in_the_last_phas
     assert tables.measured(study, "robot") == "training return"
 
 
+def test_progress_is_that_in_the_last_task_which_has_a_curriculum():
+    study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=1)
+    curve = study.curves["robot", "ppo", 0]
+    del curve["phase"]
+    curve["stage"] = np.repeat([0.0, 1.0, 2.0, 3.0], [10, 5, 5, 10])
+    turned = {"yaw": 3.0}
+    stages = [{"task": task} for task in ({}, turned, turned, turned | {"curriculum": False})]
+    study.about["methods"]["robot"]["ppo"] = stages
+    steps, values = study.curve("robot", "ppo", "progress")
+    np.testing.assert_allclose(steps, curve["frames"][:20] / 1e6)
+    assert (values[0, :10] == 0).all(), "another task"
+    np.testing.assert_allclose(values[0, 10:], (curve["level"] * curve["success"])[10:20])
+
+
 def test_recovery_is_counted_from_the_start_of_the_last_phase():
     study = make_robot_study({"ppo": (0.5, 0.5)}, {"ppo": 1.0}, {"ppo": 5}, seeds=2)
     falls_and_rises = np.concatenate([np.full(10, 9.0), np.full(8, 1.0), np.full(12, 7.0)])
@@ -143,7 +157,7 @@ def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkey
         figure.savefig(tmp_path / "figure.png")
     text = robot_tables.tables(both)
     assert text.count("Mean actions:") == 1 and "nan" not in text
-    monkeypatch.setitem(results_page.ROBOTS, "paper-robot", "robot")
+    monkeypatch.setitem(results_page.ROBOTS, "paper-robot", ("robot", "A robot"))
     page = results_page.robot_section("paper-robot", both)
     assert page.count("**confirmed**") == 8 and "too narrow" not in page
 

@@ -142,18 +142,22 @@ class Study:
         """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
 
         The column `progress` is the training return, or where there is a curriculum, in which returns fall
-        as tasks get harder, the level times the success rate (in its last phase, zero before). At every
-        point, a seed's value is its latest. So one that diverged keeps its last, and is not
-        dropped from the average; one that diverged before it had a value is.
+        as tasks get harder, the level times the success rate: zero before the last phase and the last task
+        of the curriculum, and not continued once training leaves it for the last level alone. At every
+        point, a seed's value is its latest. So one that diverged keeps its last, and is not dropped from
+        the average; one that diverged before it had a value is.
         """
         columns = list(self.curves_of(task, method).values())
+        if column == "progress":
+            stages = self.about["methods"].get(task, {}).get(method)
+            columns = [progress(c, stages) for c in columns]
         if not columns:
             return np.zeros(0), np.zeros((0, 0))
         steps = max(columns, key=lambda c: c["frames"][-1])["frames"]
         values = []
         for c in columns:
             latest = np.searchsorted(c["frames"], steps, side="right") - 1
-            own = progress(c) if column == "progress" else c.get(column, np.full(len(c["frames"]), np.nan))
+            own = c.get(column, np.full(len(c["frames"]), np.nan))
             values.append(np.where(latest < 0, np.nan, own[latest]))
         values = np.array(values)
         return steps / 1e6, values[np.isfinite(values[:, -1])]
@@ -209,12 +213,28 @@ def has_curriculum(curve: dict[str, np.ndarray]) -> bool:
     return all(np.isfinite(curve.get(name, np.nan)).any() for name in ("level", "success"))
 
 
-def progress(curve: dict[str, np.ndarray]) -> np.ndarray:
-    """How far a run has come, at every logged iteration; see `Study.curve`."""
+def progress(
+    curve: dict[str, np.ndarray], stages: list[dict[str, Any]] | None = None
+) -> dict[str, np.ndarray]:
+    """A run's curve with a column `progress`, how far it has come; see `Study.curve`.
+
+    Args:
+        curve: columns of the run.
+        stages: what each stage trained with, of `study.json`; None for one task throughout.
+    """
     if not has_curriculum(curve):
-        return curve["return"]
-    last = np.nan_to_num(curve["phase"], nan=LAST_PHASE) == LAST_PHASE if "phase" in curve else 1.0
-    return curve["level"] * curve["success"] * last
+        return curve | {"progress": curve["return"]}
+    counts = np.ones(len(curve["frames"]))
+    if "phase" in curve:
+        counts *= np.nan_to_num(curve["phase"], nan=LAST_PHASE) == LAST_PHASE
+    curve = curve | {"progress": curve["level"] * curve["success"] * counts}
+    tasks = [stage["task"] for stage in stages or []]
+    rising = [number for number, task in enumerate(tasks) if task.get("curriculum", True)]
+    if not rising:
+        return curve
+    last = [number for number in rising if tasks[number] == tasks[rising[-1]]]
+    curve["progress"] *= np.isin(curve["stage"], last)
+    return {name: values[curve["stage"] <= last[-1]] for name, values in curve.items()}
 
 
 def read(folder: Path) -> Study:

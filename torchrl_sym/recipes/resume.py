@@ -52,7 +52,7 @@ def resume(
         if start_from is None:
             call_env(env, "stagger")
         else:
-            _begin_from(start_from, env, parts)
+            _begin_from(start_from, env, parts, episodes)
         return 0, 0.0
     differences = config.differences(checkpoint["config"])
     if differences:
@@ -71,7 +71,7 @@ def resume(
     return checkpoint["iteration"], checkpoint["seconds"]
 
 
-def _begin_from(earlier: RunFolder, env: EnvBase, parts: dict[str, Any]) -> None:
+def _begin_from(earlier: RunFolder, env: EnvBase, parts: dict[str, Any], episodes: Episodes) -> None:
     """Networks, optimizer, episodes and curriculum of another run, whatever its hyper-parameters."""
     checkpoint = earlier.load()
     found = [] if checkpoint is None else list(checkpoint["parts"])
@@ -82,6 +82,7 @@ def _begin_from(earlier: RunFolder, env: EnvBase, parts: dict[str, Any]) -> None
         )
     for name, part in parts.items():
         part.load_state_dict(checkpoint["parts"][name])
+    episodes.load_state_dict(checkpoint["episodes"])
     _restore_env(env, checkpoint, finished=False)
 
 
