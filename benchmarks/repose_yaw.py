@@ -22,7 +22,7 @@ _HEADING = {"yaw": math.pi}  # at the last level; an eighth of it at the first
 SETTING = Setting(
     _PLACES.config,
     _PLACES.task,
-    evaluations={"place and heading": _HEADING},
+    evaluations={"up to half a turn": _HEADING},
     then=(
         Setting(
             dataclasses.replace(_PLACES.config, iterations=800), _PLACES.task | _HEADING

@@ -13,9 +13,9 @@ from pathlib import Path
 import tyro
 
 from comparison import claims, robot_claims
-from comparison.robot_tables import has_split, success_table, success_tables, throughput_table
+from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
-from comparison.tables import efficiency_table, table_1
+from comparison.tables import efficiency_table, markdown, table_1
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
@@ -163,14 +163,18 @@ def robot_section(name: str, study: Study) -> str:
 
 
 def robot_figures(name: str) -> str:
-    """The pictures of a robot study that have been drawn, each with what it shows."""
-    drawn = sorted(path.name for path in (HERE / "plots" / name).glob("*.png"))
-    return "\n".join(
+    """The pictures of a robot study that have been drawn, each with what it shows, and its films."""
+    folder = HERE / "plots" / name
+    drawn = sorted(path.name for path in folder.glob("*.png"))
+    text = "\n".join(
         f"![{kind}](../benchmarks/plots/{name}/{file})\n\n{prose(f'*{caption}*')}\n"
         for kind, caption in ROBOT_CAPTIONS.items()
         for file in drawn
         if file.removesuffix(".png").endswith(kind)
     )
+    films = sorted(path.name for path in folder.glob("*.mp4"))
+    films = [f"[{file}](../benchmarks/plots/{name}/{file})" for file in films]
+    return text + (f"\nFilms of the same policies (`make films`): {', '.join(films)}.\n" if films else "")
 
 
 def readme_block(study: Study) -> str:
@@ -188,30 +192,27 @@ def readme_block(study: Study) -> str:
     return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"
 
 
-def readme_robot_block(study: Study) -> str:
-    """What the README says of ANYmal-Push."""
-    task = "anymal_push"
-    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-    methods = [m for m in study.methods(task) if len(study.seeds(task, m)) > 1] or study.methods(task)
-    columns = (
-        "method",
-        "seeds",
-        "success [%]",
-        "worst goal [%]",
-        "spread [%]",
-        "return",
-        "spread of return",
-    )
-    table = success_table(study, task, methods, columns=columns)
-    episodes = " to ".join(map(str, study.about["episodes"]))
-    text = prose(f"""Interquartile means over seeds with 95 % bootstrap intervals, {episodes} episodes of
-        every goal, mean actions. *spread*: the largest difference between two equivalent goals of a seed,
-        in percentage points of success or in return.""")
-    if study.about.get("unfinished"):
-        text += "\n" + prose(
-            f"More seeds and methods are being trained: {len(study.about['unfinished'])} runs."
-        )
-    return f"ANYmal-Push after {steps:.1f} million steps:\n\n{table}\n{text}\n"
+def readme_robot_block(studies: dict[str, Study]) -> str:
+    """What the README says of the robots: plain PPO and augmentation on every task."""
+    columns = ("seeds", "success [%]", "worst goal [%]", "spread [%]")
+    rows = [["task", "method", *columns], ["---", "---", *["---:"] * len(columns)]]
+    for name, study in studies.items():
+        task, title = ROBOTS[name]
+        steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
+        what = study.evaluations(task)[0]
+        first = f"{title}{f', {what}' * (what != 'task')}, {steps:.1f} M steps"
+        for method in ("ppo", "aug"):
+            row = success_row(study, task, method)
+            rows.append([first, row["method"], *(row.get(column, "-") for column in columns)])
+            first = ""
+    episodes = max(max(study.about["episodes"]) for study in studies.values())
+    text = prose(f"""Success in {episodes} episodes of every equivalent goal, mean actions: interquartile
+        means over seeds with 95 % bootstrap intervals. *worst goal*: of the equivalent ones. *spread*: the
+        largest difference between two of them, in percentage points.""")
+    missing = sum(len(study.about.get("unfinished", [])) for study in studies.values())
+    if missing:
+        text += "\n" + prose(f"More seeds and methods are being trained: {missing} runs.")
+    return f"{markdown(rows)}\n{text}\n"
 
 
 def prose(text: str) -> str:
@@ -239,8 +240,8 @@ def main(arguments: Arguments) -> None:
     robots = {n: read(arguments.results / n) for n in ROBOTS if (arguments.results / n).exists()}
     (arguments.docs / "results.md").write_text(page(study, tuning, robots))
     blocks = {"cartpole": readme_block(study)}
-    if "paper-push" in robots:
-        blocks["anymal_push"] = readme_robot_block(robots["paper-push"])
+    if robots:
+        blocks["robots"] = readme_robot_block(robots)
     text = replace_blocks(arguments.readme.read_text(), blocks)
     arguments.readme.write_text(text)
 

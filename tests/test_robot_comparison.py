@@ -92,8 +92,7 @@ def test_success_table_by_hand():
     numbers = [float(cell) for cell in [*cells[2:9], cells[10]]]
     by_hand = [62.5, 50, 25, 6.25, 2.5, 7.5, 3.0, 0.75]
     np.testing.assert_allclose(numbers, by_hand, rtol=0.02)
-    short = robot_tables.success_table(study, "robot", columns=("method", "spread [%]")).splitlines()
-    assert short[0] == "| method | spread [%] |" and short[2] == f"| PPO | {cells[4]} |"
+    assert robot_tables.success_row(study, "robot", "ppo")["spread [%]"] == cells[4]
     text = robot_tables.success_tables(study, "robot")
     assert text.count("| PPO |") == 2 and "Mean actions:" in text
 
@@ -160,6 +159,8 @@ def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkey
     monkeypatch.setitem(results_page.ROBOTS, "paper-robot", ("robot", "A robot"))
     page = results_page.robot_section("paper-robot", both)
     assert page.count("**confirmed**") == 8 and "too narrow" not in page
+    block = results_page.readme_robot_block({"paper-robot": both})
+    assert block.count("| A robot, 3.0 M steps | PPO | 5 | ") == block.count("|  | PPO + aug. | 5 | ") == 1
 
 
 def test_a_method_without_any_evaluated_seed_is_named():

@@ -1,7 +1,5 @@
 """Tables of tasks that succeed or fail: Table I with successes, and what the time of training went into."""
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from comparison.intervals import estimate
@@ -55,7 +53,6 @@ def success_table(
     methods: list[str] | None = None,
     actions: str = "deterministic",
     what: str | None = None,
-    columns: Sequence[str] | None = None,
 ) -> str:
     """Success, task return and return of every method, each with its spread over the goals.
 
@@ -65,16 +62,17 @@ def success_table(
         methods: rows; all by default.
         actions: `deterministic` (mean actions) or `sampled`.
         what: one of the task's evaluations; the first by default.
-        columns: names of the columns to show; all by default.
     """
-    rows = [_row(study, task, method, actions, what) for method in methods or study.methods(task)]
-    known = dict.fromkeys(name for row in rows for name in row)
-    shown = [name for name in known if columns is None or name in columns]
+    rows = [success_row(study, task, method, actions, what) for method in methods or study.methods(task)]
+    shown = list(dict.fromkeys(name for row in rows for name in row))
     head = [shown, ["---", *["---:"] * (len(shown) - 1)]]
     return markdown(head + [[row.get(name, "-") for name in shown] for row in rows])
 
 
-def _row(study: Study, task: str, method: str, actions: str, what: str | None) -> dict[str, str]:
+def success_row(
+    study: Study, task: str, method: str, actions: str = "deterministic", what: str | None = None
+) -> dict[str, str]:
+    """A row of :func:`success_table`, by column."""
     row = {"method": label(method), "seeds": seeds_of(study, task, method)}
     figures = {
         column: study.goal_returns(task, method, column, actions, what)[1]
