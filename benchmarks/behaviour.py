@@ -90,7 +90,9 @@ class Recording:
 def evaluated(name: str, seconds: float | None) -> Task:
     """A task as its first evaluation has it."""
     how = next(iter(task_setting(name).evaluations.values()))
-    return environment(name)(num_envs=1, seed=0, episode_seconds=seconds, **how).task
+    if seconds is not None:
+        how = how | {"episode_seconds": seconds}
+    return environment(name)(num_envs=1, seed=0, **how).task
 
 
 def play(task: Task, checkpoint: Path, episodes: int) -> Recording:

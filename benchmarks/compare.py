@@ -26,7 +26,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from comparison import study
+from comparison import provenance, study
 from comparison.methods import METHOD_FIELDS, configure
 from comparison.pool import execute_all
 from comparison.run import Run, task_setting
@@ -74,7 +74,7 @@ def _robot(task: str, seeds: int) -> tuple[Experiment, ...]:
     return Experiment((task,), methods, seeds), Experiment((task,), ("loss-0.1", "loss-10"), 1)
 
 
-_PUSH, _CLIMB, _REPOSE = _robot("anymal_push", 5), _robot("anymal_climb", 3), _robot("trifinger_repose", 3)
+_PUSH, _CLIMB, _REPOSE = _robot("anymal_push", 5), _robot("anymal_climb", 3), _robot("trifinger_repose", 5)
 _REPOSE_YAW = (Experiment(("repose_yaw:make_env",), ("ppo", "aug"), 3),)
 
 PRESETS: dict[str, tuple[Experiment, ...]] = {
@@ -140,6 +140,7 @@ def main(arguments: Arguments) -> int:
         print("no run has been finished; there is nothing to write")
         return 1
     about = {"workers": arguments.workers, "threads": arguments.threads}
+    about["command"] = provenance.command().replace(" --collect", "")  # which makes none of the runs
     study.write(arguments.output / name, runs, failed, about)
     for path in plot.draw_all(arguments.output / name, arguments.plots / name):
         print(f"wrote {path}")

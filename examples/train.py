@@ -2,11 +2,15 @@
 
     python examples/train.py anymal_push --folder runs/push --config.augmentation all
 
-The run can be killed and started again: it continues where its last checkpoint was.
+The run can be killed and started again: it continues where its last checkpoint was. Settings of several
+stages are trained in order, the last in the folder itself, those before it in `stage_0`, ...; what is
+changed on the command line is changed in all of them.
 """
 
+import dataclasses
 import functools
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import torch
@@ -28,7 +32,7 @@ class Arguments:
     """Hyper-parameters."""
     task_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of the task in training."""
-    folder: str = "runs/train"
+    folder: Path = Path("runs/train")
     """Where metrics.csv and checkpoint.pt go."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
     """Where metrics go besides metrics.csv."""
@@ -40,24 +44,29 @@ class Arguments:
 
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    make_env = functools.partial(
-        tasks.make_env, arguments.task, num_threads=arguments.threads, **arguments.task_kwargs
-    )
-    env = make_env(num_envs=1, seed=0)
-    for _ in train(
-        arguments.config,
-        make_env,
-        env.symmetry,
-        folder=arguments.folder,
-        logger=arguments.logger,
-        progress=True,
-    ):
-        pass
-    result = evaluate(env, load_actor(arguments.folder, env, env.symmetry), arguments.episodes)
-    print(f"mean return {result.mean:.3f}, variation {result.variation:.3f}")
-    for goal, value in result.goal_means.items():
-        success = result.goal_successes.get(goal)
-        print(f"  {goal:12s} {value:.3f}" + (f", success {success:.1%}" if success is not None else ""))
+    setting = SETTINGS[arguments.task]
+    before, asked = dataclasses.asdict(setting.config), dataclasses.asdict(arguments.config)
+    changes = {name: value for name, value in asked.items() if value != before[name]}
+    default = setting.task
+    kwargs = {k: v for k, v in arguments.task_kwargs.items() if k not in default or v != default[k]}
+    make_env = functools.partial(tasks.make_env, arguments.task, num_threads=arguments.threads)
+    *first, last = setting.replace(**changes).stages
+    earlier = None
+    for number, stage in enumerate([*first, last]):
+        folder = arguments.folder if stage is last else arguments.folder / f"stage_{number}"
+        make = functools.partial(make_env, **stage.task | kwargs)
+        symmetry = make(num_envs=1, seed=0).symmetry
+        where = {"folder": folder, "start_from": earlier, "logger": arguments.logger}
+        for _ in train(stage.config, make, symmetry, **where, progress=True):
+            pass
+        earlier = folder
+    for what, evaluated in setting.evaluations.items():
+        env = make_env(num_envs=1, seed=0, **evaluated)
+        result = evaluate(env, load_actor(arguments.folder, env, env.symmetry), arguments.episodes)
+        print(f"{what}: mean return {result.mean:.3f}, variation {result.variation:.3f}")
+        for goal, value in result.goal_means.items():
+            success = result.goal_successes.get(goal)
+            print(f"  {goal:12s} {value:.3f}" + (f", success {success:.1%}" if success is not None else ""))
 
 
 if __name__ == "__main__":

@@ -10,9 +10,10 @@ The suffix of --out decides: .gif or .mp4 (pip install 'torchrl_sym[video]') a f
 side, .png a strip of key frames, one row per goal. With --overlay, a .png of all paths from above instead.
 """
 
+import functools
 import os
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -48,6 +49,8 @@ class Arguments:
     """Of the start state and of random actions."""
     stochastic: bool = False
     """Sample the policy's actions."""
+    task_kwargs: dict[str, float] = field(default_factory=dict)
+    """Numbers that the task is made with, such as: yaw 3.14."""
     overlay: bool = False
     """Draw the paths of everything that moves freely from above, instead of a film."""
     frames: int = 5
@@ -73,13 +76,14 @@ class MirroredNoise:
 
 def rollout(arguments):
     """The task, the group elements of the goals, and the states of one rollout of each."""
-    task = tasks.make_env(arguments.task, num_envs=1).task
+    make_env = functools.partial(tasks.make_env, arguments.task, **arguments.task_kwargs)
+    task = make_env(num_envs=1).task
     names = task.goal_names if arguments.goals == ("all",) else arguments.goals
     unknown = set(names) - set(task.goal_names)
     if unknown:
         raise SystemExit(f"expected goals among {task.goal_names}, got {sorted(unknown)}")
     elements = [task.goal_names.index(name) for name in names]
-    env = tasks.make_env(arguments.task, num_envs=len(elements), num_threads=1, seed=0)
+    env = make_env(num_envs=len(elements), num_threads=1, seed=0)
     start = task.sample_goal_states(1, torch.Generator().manual_seed(arguments.seed), elements)
     torch.manual_seed(arguments.seed)
     if arguments.checkpoint is None:

@@ -277,7 +277,8 @@ class AnymalClimb(Anymal):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.phase = saved["phase"]
+        if self.curriculum:  # without one it stays what was asked for
+            self.phase = saved["phase"]
         self.averages.load(saved["averages"])
 
 

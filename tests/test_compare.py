@@ -188,7 +188,7 @@ def test_presets():
     assert min(seeds.values()) == 10
     assert seeds["ppo"] == seeds["aug"] == 20
     assert {run.task for run in runs("smoke")} == set(tasks.ALL_TASKS)
-    for preset, robot_seeds in (("paper-push", 5), ("paper-climb", 3), ("paper-repose", 3)):
+    for preset, robot_seeds in (("paper-push", 5), ("paper-climb", 3), ("paper-repose", 5)):
         robot = runs(preset)
         assert {run.folder for run in robot} < folders[2]
         seeds = collections.Counter(run.method for run in robot)

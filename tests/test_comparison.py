@@ -151,14 +151,16 @@ def test_curves_of_different_lengths_are_aligned_by_steps():
 
 
 def test_verdicts_follow_the_interval():
-    assert verdicts.verdict(Estimate(1.0, 0.1, 2.0)) == "confirmed"
-    assert verdicts.verdict(Estimate(1.0, -0.1, 2.0)) == "not confirmed"
-    assert verdicts.verdict(Estimate(-1.0, -2.0, -0.1)) == "different"
+    assert verdicts.verdict(Estimate(1.0, 0.1, 2.0, 5)) == "confirmed"
+    assert verdicts.verdict(Estimate(1.0, 0.1, 2.0, 4)) == "confirmed (4 seeds)"
+    assert verdicts.verdict(Estimate(1.0, -0.1, 2.0, 5)) == "not confirmed"
+    assert verdicts.verdict(Estimate(-1.0, -2.0, -0.1, 5)) == "different"
     for rule in (verdicts.verdict, lambda gap: verdicts.no_gain(gap, 0.5)):
         assert rule(Estimate(1.0, -math.inf, math.inf)) == "undecided"
-    assert verdicts.no_gain(Estimate(1.0, 0.1, 2.0), 0.5) == "different"
-    assert verdicts.no_gain(Estimate(1.0, -0.1, 2.0), 0.5) == "not confirmed"
-    assert verdicts.no_gain(Estimate(0.1, -0.1, 0.3), 0.5) == "confirmed"
+    assert verdicts.no_gain(Estimate(1.0, 0.1, 2.0, 5), 0.5) == "different"
+    assert verdicts.no_gain(Estimate(1.0, -0.1, 2.0, 5), 0.5) == "not confirmed"
+    assert verdicts.no_gain(Estimate(0.1, -0.1, 0.3, 5), 0.5) == "confirmed"
+    assert verdicts.no_gain(Estimate(0.2, 0.1, 0.3, 5), 0.5) == "confirmed", "a gain, but below the margin"
     assert verdicts.more((10, 10), (2, 10)) == "confirmed"
     assert verdicts.more((2, 10), (10, 10)) == "different"
     assert verdicts.more((10, 10), (9, 10)) == "not confirmed"
@@ -266,6 +268,20 @@ def test_the_policy_of_the_best_seed_is_kept(tmp_path):
     best = load_actor(runs[int(np.argmax(means))].folder / "stage_0", env, env.symmetry)
     assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
     assert np.isfinite(read(tmp_path / "results").goal_returns("anymal_push", "ppo", "turning")[1]).all()
+
+
+def test_a_later_stage_that_diverges_early_leaves_the_policy_of_the_one_before(tmp_path):
+    tiny = SETTINGS["cartpole"].replace(iterations=2, num_envs=8, horizon=4, minibatches=1)
+    worse = tiny.replace(entropy_coeff=3e38)  # its gradient is not finite
+    run = Run("cartpole", "ppo", 0, dataclasses.replace(tiny, then=(worse,)), tmp_path / "run", episodes=2)
+    run.execute()
+    result = run.result()
+    assert result["outcome"].startswith("diverged") and len(result["evaluation"]) == 4
+    assert not (run.folder / "stage_1" / "checkpoint.pt").exists()
+    write(tmp_path / "results", [run], [], {"workers": 1})
+    study = read(tmp_path / "results")
+    assert study.diverged("cartpole", "ppo") == {0}
+    assert np.isfinite(study.goal_returns("cartpole", "ppo")[1]).all()
 
 
 def test_stages_follow_each_other_also_after_an_interruption(tmp_path):

@@ -173,6 +173,14 @@ def test_a_higher_level_raises_the_box(level):
     torch.testing.assert_close(target - top, torch.full_like(top, 0.5))
 
 
+def test_the_phase_of_a_checkpoint_counts_in_a_curriculum_alone():
+    saved = AnymalClimb(phase="B").state_dict()
+    rising, fixed = AnymalClimb(), AnymalClimb(phase="C", curriculum=False)
+    for task in (rising, fixed):
+        task.load_state_dict(saved)
+    assert (rising.phase, fixed.phase) == ("B", "C")
+
+
 @pytest.mark.parametrize("phase", ["A", "C"])
 def test_without_a_curriculum_every_box_has_full_height_and_the_phase_stays(phase):
     task = AnymalClimb(height=0.3, phase=phase, curriculum=False)

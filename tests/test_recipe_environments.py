@@ -12,7 +12,7 @@ from torchrl.envs.libs.dm_control import DMControlEnv
 
 import tasks
 from torchrl_sym import PointGroup, Symmetry
-from torchrl_sym.recipes import PPOConfig, train
+from torchrl_sym.recipes import PPOConfig, RunFolder, train
 from torchrl_sym.recipes.networks import make_actor
 from torchrl_sym.representations import polar, pseudoscalar, scalar, signed_permutation
 
@@ -42,6 +42,19 @@ def test_wrapped_environments_train_and_continue_with_a_warning(make_env, tmp_pa
     with pytest.warns(UserWarning, match="not exactly"):
         rest = list(train(dataclasses.replace(TINY, iterations=3), make_env, symmetry, folder=tmp_path))
     assert [row["iteration"] for row in rest] == [3]
+
+
+@pytest.mark.parametrize(("make_env", "restored"), [(TASK, True), (transformed, True), (serial, False)])
+def test_returns_of_running_episodes_continue_if_the_episodes_do(make_env, restored, tmp_path):
+    symmetry, run = TASK(num_envs=1, seed=0).symmetry, RunFolder(tmp_path)
+    list(train(TINY, make_env, symmetry, folder=tmp_path))
+    checkpoint = run.load()
+    checkpoint["episodes"]["running"] += 1e6
+    run.save(checkpoint)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        list(train(dataclasses.replace(TINY, iterations=3), make_env, symmetry, folder=tmp_path))
+    assert (run.load()["episodes"]["running"] > 1e5).any() == restored
 
 
 def test_bare_tasks_continue_without_a_warning(tmp_path):

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from torchrl_sym.recipes import RunFolder
+
 ROOT = Path(__file__).parents[1]
 TINY = ["--config.iterations", "2", "--config.num-envs", "8", "--config.horizon", "8"]
 
@@ -61,6 +63,19 @@ def test_train_and_continue(tmp_path):
     watch = ["--checkpoint", tmp_path, "--stochastic", "--seconds", "0.1", "--width", "64", "--out", film]
     run("examples/watch.py", "cartpole", *watch)
     assert film.exists()
+
+
+def test_settings_of_several_stages_are_trained_in_order(tmp_path):
+    few = ["--episodes", "1", "--config.gamma", "0.9"]
+    output = run("examples/train.py", "trifinger_repose", "--folder", tmp_path, *TINY, *few)
+    assert re.search(r"difficulty 1: mean return -?\d[^\n]*\n  right .*success", output)
+    configs = [RunFolder(folder).load()["config"] for folder in (tmp_path / "stage_0", tmp_path)]
+    assert [config["gamma"] for config in configs] == [0.9, 0.9]
+    assert [config["max_std"] for config in configs] == [1.0, 0.1]
+    watch = ["--checkpoint", tmp_path, "--task-kwargs", "yaw", "3.0", "--seconds", "0.1", "--width", "64"]
+    run("examples/watch.py", "trifinger_repose", *watch, "--out", tmp_path / "watch.gif")
+    with pytest.raises(AssertionError, match="expected a yaw in"):
+        run("examples/watch.py", "trifinger_repose", *watch[:4], "9.0", "--out", tmp_path / "watch.gif")
 
 
 def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):

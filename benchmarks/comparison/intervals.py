@@ -17,11 +17,12 @@ RESAMPLES = 2000
 
 @dataclass(frozen=True)
 class Estimate:
-    """A number and its 95 % interval."""
+    """A number, its 95 % interval, and how many seeds it is of (the fewer, of a difference)."""
 
     value: float
     low: float
     high: float
+    seeds: int = 1
 
     def format(self, digits: int = 3) -> str:
         """For a table; without interval if there is none."""
@@ -41,7 +42,7 @@ def estimate(values: np.ndarray) -> Estimate:
     if len(values) < 2:
         return Estimate(value, -math.inf, math.inf)
     low, high = band(np.asarray(values, dtype=float)[:, None])
-    return Estimate(value, float(low[0]), float(high[0]))
+    return Estimate(value, float(low[0]), float(high[0]), len(values))
 
 
 def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -57,7 +58,8 @@ def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
     """Interquartile mean of ``a`` minus that of ``b``, ``(seeds,)`` each, resampled independently."""
     value = float(iqm(a) - iqm(b))
-    if min(len(a), len(b)) < 2:
+    fewest = min(len(a), len(b))
+    if fewest < 2:
         return Estimate(value, -math.inf, math.inf)
     result = stats.bootstrap(
         (np.asarray(a, dtype=float), np.asarray(b, dtype=float)),
@@ -68,4 +70,4 @@ def difference(a: np.ndarray, b: np.ndarray) -> Estimate:
         rng=0,
     )
     interval = result.confidence_interval
-    return Estimate(value, float(interval.low), float(interval.high))
+    return Estimate(value, float(interval.low), float(interval.high), fewest)

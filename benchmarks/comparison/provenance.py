@@ -16,7 +16,7 @@ import torchrl
 def provenance() -> dict[str, Any]:
     """What has to be known to repeat a result."""
     return {
-        "command": " ".join(["python", *(_relative(argument) for argument in sys.argv)]),
+        "command": command(),
         "revision": revision(),
         "versions": {
             "python": platform.python_version(),
@@ -24,6 +24,11 @@ def provenance() -> dict[str, Any]:
         },
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+def command() -> str:
+    """The command line, without paths of this machine."""
+    return " ".join(["python", *(_relative(argument) for argument in sys.argv)])
 
 
 def revision() -> str:

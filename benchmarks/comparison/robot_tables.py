@@ -6,6 +6,7 @@ from comparison.intervals import estimate
 from comparison.methods import label
 from comparison.study import Study
 from comparison.tables import (
+    chance_variation,
     efficiency_table,
     markdown,
     seconds_per_step,
@@ -39,11 +40,13 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
             text += f"{title[0].upper()}{title[1:]}:\n\n"
             text += success_table(study, task, methods, actions, what) + "\n"
     return text + (
-        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals. *worst goal*: the\n"
-        "lowest success of a goal (mean over seeds). *spread*: the largest difference between two goals\n"
-        "of a seed; starts are paired, the noise of sampled actions is not, so that there about 3 points\n"
-        "of success are chance. *task return*: without terms of gait and effort. *turning*: yaw travelled\n"
-        "in an episode. *symmetry loss*: as in the paper, on the states of the last iteration.\n"
+        "Interquartile means over seeds, in brackets their 95 % bootstrap intervals; of three seeds, that\n"
+        "is the mean, the lowest and the highest. *worst goal*: the lowest success of a seed's goals.\n"
+        "*spread*: the largest difference between a seed's goals. Starts are paired, so that an\n"
+        "equivariant policy differs by nothing; another policy, or sampled actions, differ also by\n"
+        "*chance*: by about so many points if all goals are alike and episodes independent. *task\n"
+        "return*: without terms of gait and effort. *turning*: yaw travelled in an episode. *symmetry\n"
+        "loss*: as in the paper, on the states of the last iteration.\n"
     )
 
 
@@ -82,11 +85,14 @@ def success_row(
         return row
     success = 100 * figures["success"]
     row["success [%]"] = estimate(success.mean(axis=1)).format(1)
-    row["worst goal [%]"] = f"{success.mean(axis=0).min():.1f}"
+    row["worst goal [%]"] = estimate(success.min(axis=1)).format(1)
     row["spread [%]"] = estimate(variation(success)).format(1)
+    chance = chance_variation(figures["success"], min(study.about["episodes"]))
+    row["chance [%]"] = f"{100 * chance.mean():.1f}"
     for column, name in (("task_return", "task return"), ("return", "return")):
-        row[name] = estimate(figures[column].mean(axis=1)).format(2)
-        row[f"spread of {name}"] = estimate(variation(figures[column])).format(2)
+        if np.isfinite(figures[column]).all():
+            row[name] = estimate(figures[column].mean(axis=1)).format(2)
+            row[f"spread of {name}"] = estimate(variation(figures[column])).format(2)
     row["symmetry loss"] = symmetry_loss(study, task, method)
     if np.isfinite(figures["turning"]).any():
         row["turning [rad]"] = estimate(figures["turning"].mean(axis=1)).format(2)
@@ -113,22 +119,23 @@ def throughput_table(study: Study, task: str) -> str:
         if not every.shape[1]:
             rows.append([label(method), *["-"] * 4])
             continue
-        shares = np.median(every, axis=1)
+        shares = every.sum(axis=1) / every.sum()
         rate = 1 / seconds_per_step(study, task, method)
         rows.append([label(method), f"{rate:,.0f}", *(f"{share:.0%}" for share in shares)])
     note = (
-        "Medians of one run: a process with one thread, beside as many others as ran at a time.\n"
+        "Of all seeds, each a process with one thread beside as many others as ran at a time; steps per\n"
+        "second are the median over logged iterations, shares are of the sum.\n"
         "*updates and the rest*: all that is not the collection of data.\n"
     )
     return markdown(rows) + "\n" + note
 
 
 def _split(curve: dict[str, np.ndarray]) -> np.ndarray:
-    """Shares of physics, the rest of the collection, and the rest, ``(3, intervals)``."""
+    """Seconds of physics, the rest of the collection, and the rest, ``(3, intervals)``."""
     whole = np.diff(curve["seconds"]) / np.diff(curve["frames"])
     same = np.diff(curve.get("stage", np.zeros(len(curve["frames"])))) == 0
     steps = (np.diff(curve["frames"]) / np.maximum(np.diff(curve["iteration"]), 1))[same]
     each = whole[same] * steps  # seconds of an iteration
     physics, collect = (curve[f"{name}_seconds"][1:][same] for name in ("physics", "collect"))
-    shares = np.stack([physics, collect - physics, each - collect]) / each
-    return shares[:, np.isfinite(shares).all(axis=0)]
+    split = np.stack([physics, collect - physics, each - collect])
+    return split[:, np.isfinite(split).all(axis=0)]

@@ -134,19 +134,19 @@ class Run:
             "iterations": len(curve),
             "frames": curve[-1]["frames"] if curve else 0,
             "seconds": curve[-1]["seconds"] if curve else 0.0,
-            "evaluation": self._evaluate(make_env, stage_folders(self.folder)[-1]),
+            "evaluation": self._evaluate(make_env),
         }
         write_json(self.folder / "result.json", self.request() | ended)
 
-    def _evaluate(self, make_env: Callable[..., EnvBase], checkpoint: Path) -> list[dict[str, Any]]:
-        """One row per evaluated task, kind of actions and goal; none if there is no checkpoint."""
+    def _evaluate(self, make_env: Callable[..., EnvBase]) -> list[dict[str, Any]]:
+        """One row per evaluated task, kind of actions and goal; none if it diverged before a checkpoint."""
         rows = []
+        checkpoint = last_checkpoint(self.folder)
+        if checkpoint is None:
+            return rows
         for what, kwargs in self.setting.evaluations.items():
             env = make_env(num_envs=1, seed=EVALUATION_SEED, **kwargs)
-            try:
-                actor = load_actor(checkpoint, env, env.symmetry)
-            except FileNotFoundError:  # it diverged before the first one
-                return []
+            actor = load_actor(checkpoint, env, env.symmetry)
             for actions, exploration in ACTIONS.items():
                 if isinstance(env, BatchedEnv):
                     threads = {"num_threads": self.threads, "exploration": exploration}
@@ -174,6 +174,12 @@ def train_stages(
 def stage_folders(folder: Path) -> list[Path]:
     """Folders of the stages that have begun, in order."""
     return sorted(folder.glob("stage_*"), key=lambda path: int(path.name.removeprefix("stage_")))
+
+
+def last_checkpoint(folder: Path) -> Path | None:
+    """The last stage that has a checkpoint; one that diverged early has none of its own."""
+    kept = [stage for stage in stage_folders(folder) if (stage / "checkpoint.pt").exists()]
+    return kept[-1] if kept else None
 
 
 def read_curve(folder: Path) -> list[dict[str, float]]:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from comparison.provenance import provenance
-from comparison.run import Run, read_curve, stage_folders, write_json
+from comparison.run import Run, last_checkpoint, read_curve, write_json
 from torchrl_sym.recipes import export_actor
 
 RUN = ("task", "method", "seed")
@@ -76,7 +76,9 @@ def write(
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
-        export_actor(stage_folders(run.folder)[-1], policy_folder(folder, run.task) / run.method)
+        checkpoint = last_checkpoint(run.folder)
+        assert checkpoint is not None, "it was evaluated"
+        export_actor(checkpoint, policy_folder(folder, run.task) / run.method)
     first = (*RUN, "outcome", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
@@ -147,20 +149,23 @@ class Study:
         point, a seed's value is its latest. So one that diverged keeps its last, and is not dropped from
         the average; one that diverged before it had a value is.
         """
-        columns = list(self.curves_of(task, method).values())
-        if column == "progress":
-            stages = self.about["methods"].get(task, {}).get(method)
-            columns = [progress(c, stages) for c in columns]
+        own = self.with_progress if column == "progress" else self.curves_of
+        columns = list(own(task, method).values())
         if not columns:
             return np.zeros(0), np.zeros((0, 0))
         steps = max(columns, key=lambda c: c["frames"][-1])["frames"]
         values = []
         for c in columns:
             latest = np.searchsorted(c["frames"], steps, side="right") - 1
-            own = c.get(column, np.full(len(c["frames"]), np.nan))
-            values.append(np.where(latest < 0, np.nan, own[latest]))
+            logged = c.get(column, np.full(len(c["frames"]), np.nan))
+            values.append(np.where(latest < 0, np.nan, logged[latest]))
         values = np.array(values)
         return steps / 1e6, values[np.isfinite(values[:, -1])]
+
+    def with_progress(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
+        """Columns of a method's curves as far as `progress` goes, by seed; see :meth:`curve`."""
+        stages = self.about["methods"].get(task, {}).get(method) or []
+        return {seed: with_progress(c, stages) for seed, c in self.curves_of(task, method).items()}
 
     def evaluations(self, task: str) -> list[str]:
         """What was evaluated after training on a task, in order."""
@@ -213,28 +218,26 @@ def has_curriculum(curve: dict[str, np.ndarray]) -> bool:
     return all(np.isfinite(curve.get(name, np.nan)).any() for name in ("level", "success"))
 
 
-def progress(
-    curve: dict[str, np.ndarray], stages: list[dict[str, Any]] | None = None
-) -> dict[str, np.ndarray]:
-    """A run's curve with a column `progress`, how far it has come; see `Study.curve`.
+def with_progress(curve: dict[str, np.ndarray], stages: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+    """A run's curve, as long as there is a curriculum, with a column `progress`; see `Study.curve`.
 
     Args:
         curve: columns of the run.
-        stages: what each stage trained with, of `study.json`; None for one task throughout.
+        stages: what each stage trained with, of `study.json`; empty for one task throughout.
     """
     if not has_curriculum(curve):
         return curve | {"progress": curve["return"]}
     counts = np.ones(len(curve["frames"]))
     if "phase" in curve:
         counts *= np.nan_to_num(curve["phase"], nan=LAST_PHASE) == LAST_PHASE
-    curve = curve | {"progress": curve["level"] * curve["success"] * counts}
-    tasks = [stage["task"] for stage in stages or []]
+    tasks = [stage["task"] for stage in stages]
     rising = [number for number, task in enumerate(tasks) if task.get("curriculum", True)]
-    if not rising:
-        return curve
-    last = [number for number in rising if tasks[number] == tasks[rising[-1]]]
-    curve["progress"] *= np.isin(curve["stage"], last)
-    return {name: values[curve["stage"] <= last[-1]] for name, values in curve.items()}
+    if rising:
+        last = [number for number in rising if tasks[number] == tasks[rising[-1]]]
+        counts *= np.isin(curve["stage"], last)
+        curve = {name: values[curve["stage"] <= last[-1]] for name, values in curve.items()}
+        counts = counts[: len(curve["frames"])]
+    return curve | {"progress": curve["level"] * curve["success"] * counts}
 
 
 def read(folder: Path) -> Study:

@@ -48,11 +48,6 @@ def symmetry_loss(study: Study, task: str, method: str) -> str:
     return f"{np.exp(iqm(np.log(np.maximum(curves[:, -1], 1e-12)))):.2g}" if len(curves) else "-"
 
 
-def has_success(study: Study, task: str) -> bool:
-    """Whether episodes of a task succeed or fail."""
-    return any(row["task"] == task and row.get("success") is not None for row in study.runs)
-
-
 def measured(study: Study, task: str) -> str:
     """What tells how far a training has come; see `Study.curve`."""
     curves = study.curves_of_task(task)
@@ -83,6 +78,24 @@ def efficiency_table(study: Study, task: str) -> str:
 def variation(returns: np.ndarray) -> np.ndarray:
     """Largest difference between the mean returns of two goals, ``(seeds, goals)`` to ``(seeds,)``."""
     return returns.max(axis=1) - returns.min(axis=1)
+
+
+def chance_variation(rates: np.ndarray, episodes: int) -> np.ndarray:
+    """Variation between goals that succeed equally often, of as many episodes each, by chance.
+
+    Expected range of normal draws with the binomial's deviation. Episodes count as independent, so it is
+    more than starts that are paired leave, of which an equivariant policy makes the same.
+
+    Args:
+        rates: success rates, ``(seeds, goals)``.
+        episodes: of each goal.
+
+    Returns:
+        ``(seeds,)``.
+    """
+    draws = np.random.default_rng(0).normal(size=(20_000, rates.shape[1]))
+    mean = rates.mean(axis=1)
+    return np.ptp(draws, axis=1).mean() * np.sqrt(mean * (1 - mean) / episodes)
 
 
 def threshold(study: Study, task: str) -> float:

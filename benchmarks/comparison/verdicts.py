@@ -3,7 +3,8 @@
 Two methods are compared by the difference of interquartile means over seeds and its 95 % bootstrap
 interval: *confirmed* if the interval lies on the claimed side of zero, *different* if it lies on the other
 side, *not confirmed* if it contains zero. That something gains nothing is confirmed if the whole interval
-is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %.
+is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %. A verdict on fewer than five
+seeds says on how many.
 """
 
 import math
@@ -20,6 +21,9 @@ from comparison.study import LAST_PHASE, Study
 from comparison.tables import SHARE, SMOOTHING, smooth, steps_to, threshold, variation
 
 Judgement = tuple[str, str]  # evidence, verdict
+# Verdicts on fewer seeds say so: where two methods do not differ, one in ten is confirmed by chance with
+# three seeds, one in thirty with five.
+FEW = 5
 
 
 @dataclass(frozen=True)
@@ -30,7 +34,7 @@ class Claim:
     place: str
     judge: Callable[[Any], Any]  # Judgement, or None where there is nothing to judge
     methods: tuple[str, ...] = ()
-    figure: str = "return"
+    figure: str | None = "return"  # what an evaluation must have; None where training alone is judged
 
     def row(self, judgement: Judgement) -> list[str]:
         """Its row in a table."""
@@ -42,7 +46,7 @@ class Claims(list[Claim]):
 
     HEAD = (["claim", "place", "evidence here", "verdict"], ["---"] * 4)
 
-    def __call__(self, text: str, place: str, *methods: str, figure: str = "return"):
+    def __call__(self, text: str, place: str, *methods: str, figure: str | None = "return"):
         """Register a judge where it is defined."""
 
         def register(judge: Callable[[Any], Any]):
@@ -68,7 +72,7 @@ def symmetry_loss(study: Study, method: str, *, task: str) -> np.ndarray:
 
 
 def steps(study: Study, method: str, *, task: str) -> np.ndarray:
-    """Million steps to the threshold; seeds that never reach it count as the whole run."""
+    """Million steps to the threshold; seeds that never reach it count as the whole curve."""
     reached = steps_to(study, task, method, threshold(study, task))
     return np.minimum(reached, study.curve(task, method, "progress")[0][-1])
 
@@ -76,15 +80,15 @@ def steps(study: Study, method: str, *, task: str) -> np.ndarray:
 def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
     """Million steps from the start of a curriculum's last phase to nine tenths of what is regained in it.
 
-    That is, of the way from the lowest training return of the phase to the last one; a seed that never
-    enters the phase counts as its whole run.
+    That is, of the way from the lowest training return of the phase to the last one in the curriculum; NaN
+    for a seed that never enters the phase.
     """
     taken = []
-    for curve in study.curves_of(task, method).values():
-        there = np.flatnonzero(curve["phase"] == LAST_PHASE)
+    for curve in study.with_progress(task, method).values():
+        there = np.flatnonzero((curve["phase"] == LAST_PHASE) & np.isfinite(curve["return"]))
         steps_, level = curve["frames"][there] / 1e6, curve["return"][there]
         if len(there) < SMOOTHING:
-            taken.append(curve["frames"][-1] / 1e6)
+            taken.append(np.nan)
             continue
         level = smooth(level[None])[0]
         lowest = int(level.argmin())
@@ -94,22 +98,32 @@ def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
     return np.array(taken)
 
 
+def counted(study: Study, method: str, *, task: str) -> str:
+    """How many seeds of a method reach the threshold, as text."""
+    reached = steps_to(study, task, method, threshold(study, task))
+    return f"{label(method)} {np.isfinite(reached).sum()} of {len(reached)}"
+
+
 def verdict(claimed_positive: Estimate) -> str:
     """The rule for a difference that the paper says is positive; undecided without an interval."""
     if not math.isfinite(claimed_positive.low):
         return "undecided"
     if claimed_positive.low > 0:
-        return "confirmed"
-    return "different" if claimed_positive.high < 0 else "not confirmed"
+        return _of_seeds("confirmed", claimed_positive)
+    return _of_seeds("different" if claimed_positive.high < 0 else "not confirmed", claimed_positive)
 
 
 def no_gain(gain: Estimate, margin: float) -> str:
     """The rule for a gain that the paper says is none; undecided without an interval."""
     if not math.isfinite(gain.low):
         return "undecided"
-    if gain.low > 0:
-        return "different"
-    return "confirmed" if gain.high < margin else "not confirmed"
+    if gain.high < margin:
+        return _of_seeds("confirmed", gain)
+    return _of_seeds("different" if gain.low > 0 else "not confirmed", gain)
+
+
+def _of_seeds(outcome: str, gap: Estimate) -> str:
+    return outcome if gap.seeds >= FEW else f"{outcome} ({gap.seeds} seeds)"
 
 
 def more(a: tuple[int, int], b: tuple[int, int]) -> str:

@@ -62,8 +62,7 @@ def resume(
         )
     for name, part in parts.items():
         part.load_state_dict(checkpoint["parts"][name])
-    episodes.load_state_dict(checkpoint["episodes"])
-    _restore_env(env, checkpoint, finished=checkpoint["iteration"] >= config.iterations)
+    _restore_env(env, checkpoint, episodes, finished=checkpoint["iteration"] >= config.iterations)
     torch.set_rng_state(checkpoint["rng"])
     if torch.cuda.is_available() and len(checkpoint["cuda_rng"]) == torch.cuda.device_count():
         torch.cuda.set_rng_state_all(checkpoint["cuda_rng"])
@@ -82,15 +81,17 @@ def _begin_from(earlier: RunFolder, env: EnvBase, parts: dict[str, Any], episode
         )
     for name, part in parts.items():
         part.load_state_dict(checkpoint["parts"][name])
-    episodes.load_state_dict(checkpoint["episodes"])
-    _restore_env(env, checkpoint, finished=False)
+    _restore_env(env, checkpoint, episodes, finished=False)
 
 
-def _restore_env(env: EnvBase, checkpoint: dict[str, Any], *, finished: bool) -> None:
+def _restore_env(env: EnvBase, checkpoint: dict[str, Any], episodes: Episodes, *, finished: bool) -> None:
     if isinstance(env, TransformedEnv):
         env.transform.load_state_dict(checkpoint["transforms"])
     if checkpoint["env"] is not None:
         call_env(env, "restore_state", checkpoint["env"])
+        episodes.load_state_dict(checkpoint["episodes"])
+    else:  # new episodes begin, whose returns are theirs alone
+        episodes.latest = checkpoint["episodes"]["latest"]
     if not finished and (checkpoint["env"] is None or isinstance(env, TransformedEnv)):
         warnings.warn(
             "the run continues with the networks and optimizer it had, but not exactly: the environment "
