@@ -173,7 +173,7 @@ def test_spread_of_success_is_confirmed_beyond_chance_alone():
     row = next(
         line for line in robot_claims.table(study, "robot").splitlines() if "variation between" in line
     )
-    assert "success: different" in row or "success: not confirmed" in row
+    assert "success: not confirmed" in row, "not different: what was taken off is an upper bound"
     study = make_robot_study({"ppo": (0.8, 0.9), "aug": (0.9, 0.9)}, losses, starts)
     row = next(
         line for line in robot_claims.table(study, "robot").splitlines() if "variation between" in line

@@ -6,6 +6,7 @@ upper bound off. Sampled actions are in the tables. A claim whose methods are no
 figures a task does not have, is left out.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -99,8 +100,10 @@ def _variation(results: Results) -> Judgement:
         text += f", ratio of means {plain.mean() / max(copies.mean(), 1e-12):.1f}"
         if column == "success":
             chance = results.chance("ppo")
-            gap = difference(plain - chance, copies)
-            text += f"; without what chance explains of PPO's, {chance.mean():.3f} at most: {gap.format()}"
+            certain = difference(plain - chance, copies)
+            text += f"; without what chance explains of PPO's, {chance.mean():.3f} at most: "
+            text += certain.format()
+            gap = dataclasses.replace(gap, low=certain.low)  # an upper bound confirms, it does not refute
         texts.append(f"{name}: {text}")
         outcomes[column] = verdict(gap)
     return "; ".join(texts), joined(**outcomes)
