@@ -50,10 +50,10 @@ def main(arguments: Arguments) -> None:
     default = setting.task
     kwargs = {k: v for k, v in arguments.task_kwargs.items() if k not in default or v != default[k]}
     make_env = functools.partial(tasks.make_env, arguments.task, num_threads=arguments.threads)
-    *first, last = setting.replace(**changes).stages
+    stages = setting.replace(**changes).stages
     earlier = None
-    for number, stage in enumerate([*first, last]):
-        folder = arguments.folder if stage is last else arguments.folder / f"stage_{number}"
+    for number, stage in enumerate(stages):
+        folder = arguments.folder if stage is stages[-1] else arguments.folder / f"stage_{number}"
         make = functools.partial(make_env, **stage.task | kwargs)
         symmetry = make(num_envs=1, seed=0).symmetry
         where = {"folder": folder, "start_from": earlier, "logger": arguments.logger}
