@@ -12,7 +12,7 @@ from torchrl.envs.utils import ExplorationType
 from comparison import claims, methods, tables, verdicts
 from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
-from comparison.run import Run, environment, read_curve, task_setting
+from comparison.run import Run, environment, read_curve, task_setting, write_json
 from comparison.study import Study, read, write
 from tasks.anymal_push import AnymalPush
 from tasks.settings import SETTINGS
@@ -242,6 +242,17 @@ def test_results_survive_writing_and_reading(tmp_path):
     steps, losses = study.curve("cartpole", "ppo", "mirror_loss")
     assert steps.tolist() == [32e-6, 64e-6]
     np.testing.assert_allclose(losses[0], [row["mirror_loss"] for row in read_curve(run.folder)], rtol=1e-5)
+    # What was trained elsewhere says so, wherever it is collected.
+    stored = run.result()
+    other = dataclasses.replace(run, seed=7, setting=setting.replace(seed=7), folder=tmp_path / "other")
+    other.folder.mkdir()
+    elsewhere = {"machine": "elsewhere", "versions": stored["versions"] | {"torch": "0"}, "revision": "r"}
+    write_json(other.folder / "result.json", stored | other.request() | elsewhere)
+    write(tmp_path / "results", [run, other], [], {"workers": 1})
+    about = read(tmp_path / "results").about
+    assert about["machine"] == " / ".join(sorted([stored["machine"], "elsewhere"]))
+    assert about["versions"] == stored["versions"] | {"torch": f"0 / {torch.__version__}"}
+    assert about["revisions"] == sorted([stored["revision"], "r"])
     # Asked for something else, it counts as not done, and its folder is refused.
     assert dataclasses.replace(run, episodes=3).result() is None
     longer = dataclasses.replace(run, setting=setting.replace(iterations=3))

@@ -4,6 +4,7 @@ import os
 import platform
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,12 @@ import torchrl
 
 def provenance() -> dict[str, Any]:
     """What has to be known to repeat a result."""
+    return {"command": command()} | origin()
+
+
+def origin() -> dict[str, Any]:
+    """The code that runs here: its commit, versions and machine."""
     return {
-        "command": command(),
         "revision": revision(),
         "versions": {
             "python": platform.python_version(),
@@ -24,6 +29,22 @@ def provenance() -> dict[str, Any]:
         },
         "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
     }
+
+
+def joint_origin(origins: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """Origins of several runs as one: commits as a list, what differs elsewhere side by side."""
+    each = list(origins)
+    names = dict.fromkeys(name for one in each for name in one["versions"])
+    versions = {name: _side_by_side(one["versions"].get(name, "none") for one in each) for name in names}
+    return {
+        "revisions": sorted({one["revision"] for one in each}),
+        "versions": versions,
+        "machine": _side_by_side(one["machine"] for one in each),
+    }
+
+
+def _side_by_side(texts: Iterable[str]) -> str:
+    return " / ".join(sorted(set(texts)))
 
 
 def command() -> str:

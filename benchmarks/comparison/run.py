@@ -25,7 +25,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import tasks
-from comparison.provenance import revision
+from comparison.provenance import origin
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tasks.settings import SETTINGS, Setting
@@ -130,13 +130,12 @@ class Run:
         curve = read_curve(self.folder)
         ended = {
             "outcome": outcome,
-            "revision": revision(),
             "iterations": len(curve),
             "frames": curve[-1]["frames"] if curve else 0,
             "seconds": curve[-1]["seconds"] if curve else 0.0,
             "evaluation": self._evaluate(make_env),
         }
-        write_json(self.folder / "result.json", self.request() | ended)
+        write_json(self.folder / "result.json", self.request() | origin() | ended)
 
     def _evaluate(self, make_env: Callable[..., EnvBase]) -> list[dict[str, Any]]:
         """One row per evaluated task, kind of actions and goal; none if it diverged before a checkpoint."""

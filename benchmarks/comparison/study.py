@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from comparison.provenance import provenance
+from comparison.provenance import joint_origin, provenance
 from comparison.run import Run, last_checkpoint, read_curve, write_json
 from torchrl_sym.recipes import export_actor
 
@@ -49,7 +49,8 @@ def write(
         points: rows per curve that are kept, at most; the last one always is.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    evaluated, curves, methods, revisions, episodes = [], [], {}, set(), set()
+    evaluated, curves, methods, origins, episodes = [], [], {}, [], set()
+    here = provenance()
     best: dict[tuple[str, str], list[tuple[float, Run]]] = {}
     unfinished: list[str] = []
     for run in runs:
@@ -72,7 +73,7 @@ def write(
         )  # not of what there is: all seeds keep the same iterations
         kept = [row for number, row in enumerate(curve, 1) if number % every == 0 or number == len(curve)]
         curves += [name | row for row in kept]
-        revisions.add(result["revision"])
+        origins.append({key: result.get(key, here[key]) for key in ("revision", "versions", "machine")})
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
@@ -83,7 +84,7 @@ def write(
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
-    about = provenance() | {"revisions": sorted(revisions), "episodes": sorted(episodes)} | about
+    about = here | joint_origin(origins) | {"episodes": sorted(episodes)} | about
     about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
     write_json(folder / "study.json", about)
 
