@@ -13,6 +13,7 @@ from pathlib import Path
 import tyro
 
 from comparison import claims, robot_claims
+from comparison.methods import parts
 from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
 from comparison.tables import efficiency_table, markdown, table_1
@@ -142,8 +143,10 @@ def robot_section(name: str, study: Study) -> str:
     made = prose(f"""`{about["command"]}` at {", ".join(about["revisions"])}: {len(study.curves)} runs of
         {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
         `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
-        found with augmentation and are used for all methods; none was tuned by itself, but for the weight
-        of the mirror loss: the one whose first seed had the highest return got all seeds.""")
+        found with augmentation and are used for all methods; none was tuned by itself.""")
+    if any(parts(method)[1] for method in study.methods(task)):
+        made += "\n\n" + prose("""Of the weights of the mirror loss, the one whose first seed had the highest
+            return got all seeds.""")
     if about.get("unfinished"):
         made += "\n\n" + prose(f"""**Still in progress**: {len(about["unfinished"])} runs of this comparison
             have not been made yet. The same command makes them.""")
