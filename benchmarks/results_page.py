@@ -145,8 +145,8 @@ def robot_section(name: str, study: Study) -> str:
         `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
         found with augmentation and are used for all methods; none was tuned by itself.""")
     if any(parts(method)[1] for method in study.methods(task)):
-        made += "\n\n" + prose("""Of the weights of the mirror loss, the one whose first seed had the highest
-            return got all seeds.""")
+        made += "\n\n" + prose("""Of the weights of the mirror loss, the one whose first seed had the
+            highest return got all seeds.""")
     if about.get("unfinished"):
         made += "\n\n" + prose(f"""**Still in progress**: {len(about["unfinished"])} runs of this comparison
             have not been made yet. The same command makes them.""")
