@@ -29,7 +29,13 @@ ROBOTS = {
 """Studies of robots, their tasks and titles; those that have no results yet are left out."""
 _FALLS_ALONE = """In seeds that were trained before 6e928cf, the training returns of the first seven seconds
     of the second stage were those of episodes that had fallen, and have been left out."""
-REMARKS = {"paper-push": _FALLS_ALONE, "paper-climb": _FALLS_ALONE}
+_SAME_BEGINNING = """The first stage of every run is that of the same method and seed of paper-repose,
+    copied: the settings are the same."""
+REMARKS = {
+    "paper-push": _FALLS_ALONE,
+    "paper-climb": _FALLS_ALONE,
+    "paper-repose-yaw": _SAME_BEGINNING,
+}
 """What else has to be known of a study."""
 README_METHODS = ["ppo", "loss-0.1", "aug-naive", "aug", "aug-random"]
 CAPTIONS = {

@@ -4,7 +4,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,15 +31,15 @@ def origin() -> dict[str, Any]:
     }
 
 
-def joint_origin(origins: Iterable[dict[str, Any]]) -> dict[str, Any]:
+def joint_origin(origins: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Origins of several runs as one: commits as a list, what differs elsewhere side by side."""
-    each = list(origins)
-    names = dict.fromkeys(name for one in each for name in one["versions"])
-    versions = {name: _side_by_side(one["versions"].get(name, "none") for one in each) for name in names}
+    names = dict.fromkeys(name for each in origins for name in each["versions"])
     return {
-        "revisions": sorted({one["revision"] for one in each}),
-        "versions": versions,
-        "machine": _side_by_side(one["machine"] for one in each),
+        "revisions": sorted({each["revision"] for each in origins}),
+        "versions": {
+            name: _side_by_side(each["versions"].get(name, "none") for each in origins) for name in names
+        },
+        "machine": _side_by_side(each["machine"] for each in origins),
     }
 
 
