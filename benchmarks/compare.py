@@ -74,9 +74,8 @@ def _robot(task: str, seeds: int, weight: str, others: Sequence[str]) -> tuple[E
     return Experiment((task,), methods, seeds), Experiment((task,), tuple(f"loss-{w}" for w in others), 1)
 
 
-# Climb has the weight that won on Push and on Repose, until its own first seeds decide.
 _PUSH = _robot("anymal_push", 5, "10", ("1", "100"))
-_CLIMB = _robot("anymal_climb", 3, "10", ("1", "100"))
+_CLIMB = _robot("anymal_climb", 3, "1", ("0.1", "10"))
 _REPOSE = _robot("trifinger_repose", 3, "10", ("0.1", "1", "100"))
 _REPOSE_YAW = (Experiment(("repose_yaw:make_env",), ("ppo", "aug"), 3),)
 
