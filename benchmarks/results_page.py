@@ -152,7 +152,7 @@ def robot_section(name: str, study: Study) -> str:
         found with augmentation and are used for all methods; none was tuned by itself.""")
     if any(parts(method)[1] for method in study.methods(task)):
         made += "\n\n" + prose("""Of the weights of the mirror loss, the one whose first seed had the
-            highest return got all seeds.""")
+            highest return, in the mean of all evaluations, got all seeds.""")
     if about.get("unfinished"):
         made += "\n\n" + prose(f"""**Still in progress**: {len(about["unfinished"])} runs of this comparison
             have not been made yet. The same command makes them.""")
