@@ -200,7 +200,7 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
     for method, recording in recordings.items():
         task = recording.task
         cameras = [task.model.camera(i).name for i in range(task.model.ncam)]
-        camera = "follow" if "follow" in cameras else None
+        camera = next((name for name in ("follow", "close") if name in cameras), None)
         chosen = np.linspace(0, len(recording.states) - 1, FRAMES).round().astype(int)
         for g in goals:
             first = recording.elements.index(g)

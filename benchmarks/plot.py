@@ -23,7 +23,7 @@ from comparison.intervals import band, iqm
 from comparison.methods import label, parts
 from comparison.robot_tables import has_success, tables
 from comparison.study import Study, has_curriculum, read
-from comparison.tables import measured, seconds_per_step, steps_to, threshold
+from comparison.tables import crossings, measured, threshold
 
 HERE = Path(__file__).parent
 COLORS = {
@@ -201,7 +201,10 @@ def success(study: Study):
 
 
 def phases(study: Study):
-    """Every seed's training return, with a mark where its curriculum enters another phase."""
+    """Every seed's training return, with a tick where its curriculum enters another phase.
+
+    The letter is where the median seed enters it.
+    """
     shown = [
         (task, method)
         for task in study.tasks
@@ -216,13 +219,18 @@ def phases(study: Study):
             steps = own["frames"] / 1e6
             axis.plot(steps, own["return"], color=color(method), linewidth=0.9, alpha=0.8)
             entered = np.flatnonzero(np.diff(own["phase"]) > 0) + 1
-            for at in entered:
-                axis.plot(steps[at], own["return"][at], "o", color="black", markersize=3)
-                name = "ABC"[int(own["phase"][at])]
-                axis.annotate(name, (steps[at], own["return"][at]), (0, 5), textcoords="offset points")
+            axis.plot(steps[entered], own["return"][entered], "|", color="black", markersize=9)
         axis.set(title=f"{task}: {label(method)}", xlabel=STEPS)
     axes[0, 0].set_ylabel("training return, per seed")
     share_limits(axes[0])
+    for axis, (task, method) in zip(axes[0], shown, strict=True):
+        for number, name in enumerate("BC", 1):
+            own = [c for c in study.curves_of(task, method).values() if (c["phase"] >= number).any()]
+            if own:
+                middle = np.median([c["frames"][(c["phase"] >= number).argmax()] for c in own]) / 1e6
+                axis.axvline(middle, color="black", linewidth=0.6, linestyle=":")
+                place = (middle, 1.0)
+                axis.annotate(name, place, (2, -9), axis.get_xaxis_transform(), "offset points", fontsize=8)
     return figure
 
 
@@ -253,23 +261,22 @@ def goals(study: Study):
 
 
 def efficiency(study: Study):
-    """Share of seeds whose training return has reached a threshold, over steps and over seconds."""
+    """Share of seeds whose progress has reached a threshold, over steps and over seconds."""
     figure, panels = pairs(len(study.tasks))
     for (top, bottom), task in zip(panels, study.tasks, strict=True):
         goal = threshold(study, task)
         for method in compared(study, task):
-            reached = np.sort(steps_to(study, task, method, goal))
-            steps = study.curve(task, method, "progress")[0]
-            if not len(steps):
+            curves = study.with_progress(task, method).values()
+            if not curves:
                 continue
-            share = np.arange(1, len(reached) + 1) / len(reached)
-            known = np.isfinite(reached)
-            end = steps[-1]
-            x = np.concatenate([[0.0], reached[known], [end]])
-            y = np.concatenate([[0.0], share[known], share[known][-1:] if known.any() else [0.0]])
+            ends = np.array([(c["frames"][-1] / 1e6, c["seconds"][-1]) for c in curves]).max(axis=0)
             style = {"color": color(method), "label": label(method), "where": "post", "linewidth": 1.4}
-            top.step(x, y, **style)
-            bottom.step(x * 1e6 * seconds_per_step(study, task, method), y, **style)
+            for axis, reached, end in zip(
+                (top, bottom), crossings(study, task, method, goal).T, ends, strict=True
+            ):
+                x = np.sort(reached[np.isfinite(reached)])
+                share = np.arange(len(x) + 1) / len(reached)
+                axis.step([0.0, *x, end], [*share, share[-1]], **style)
         top.set(
             title=f"{task}: {measured(study, task)} ≥ {goal:.2f}",
             xlabel=STEPS,

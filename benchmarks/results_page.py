@@ -27,8 +27,8 @@ ROBOTS = {
     "paper-repose-yaw": ("repose_yaw:make_env", "Trifinger-Repose: place and heading"),
 }
 """Studies of robots, their tasks and titles; those that have no results yet are left out."""
-_FALLS_ALONE = """In seeds that were trained before 6e928cf, the training returns of the first seven seconds
-    of the second stage were those of episodes that had fallen, and have been left out."""
+_FALLS_ALONE = """In the oldest seeds the training returns of the first seven seconds of the second stage
+    were those of episodes that had fallen, and have been left out: there `curves.csv` has none."""
 _SAME_BEGINNING = """The first stage of every run is that of the same method and seed of paper-repose,
     copied: the settings are the same."""
 REMARKS = {
@@ -50,18 +50,23 @@ CAPTIONS = {
 
 ROBOT_CAPTIONS = {
     "paths": "The best seed's policy from above: what moves freely (the robot, its object dashed; of the "
-    "fingers, the cube), equivalent goals in colours; on the right all mapped back onto one goal (the "
-    "paper's figure of observed trajectories).",
+    "fingers, the cube), from dots to squares, the targets. Colours are equivalent goals, of several "
+    "starts each; on the right all mapped back onto one (the paper's figure of observed trajectories). "
+    "Front and left are a walking robot's own, whose heading at the start is random.",
     "touches": "The best seed's policy: share of the time in contact with the cube that each limb has a "
     "part in, goal by goal.",
     "heights": "The best seed's policy: success over the height of the box, facing it.",
     "frames": "Key frames of two equivalent goals, the best seed's policy of each method.",
-    "training": "Training return and symmetry loss; here and below without methods that one seed tried.",
+    "training": "Training return and symmetry loss; in curves, here and below, methods that one seed tried "
+    "are left out.",
     "success": "Success in training, an average that begins at zero in every phase of a curriculum, and "
     "the level. Who passes the last level goes on at any, so with success everywhere the mean level is "
     "about two thirds of the last; at the end of Climb and Repose all are at the last.",
-    "phases": "Every seed's training return through the phases of the curriculum.",
-    "goals": "Success of every seed on every equivalent goal, in the first evaluation above.",
+    "phases": "Every seed's training return through the phases of the curriculum; a tick where it enters "
+    "the next, a line where the median seed does: B, no longer paid for walking; C, starting with any "
+    "heading. The dip at the end is the second stage: the highest box alone.",
+    "goals": "Success of every seed on every equivalent goal, in the first evaluation above, also of "
+    "methods that one seed tried.",
     "efficiency": "Share of seeds that have come so far, over environment steps and over time.",
 }
 
@@ -89,15 +94,16 @@ def page(study: Study, tuning: str, robots: dict[str, Study]) -> str:
     )
     made = prose(f"""Made by `python benchmarks/results_page.py` from
         [benchmarks/results](../benchmarks/results); a test compares. The runs: `{about["command"]}` at
-        {", ".join(about["revisions"])} ({versions}; {about["machine"]}, {about["workers"]} runs at a
-        time, one thread each; {len(study.curves)} runs, {hours:.1f} hours of one core in training).
+        {", ".join(about["revisions"])} (+: with changes on top; {versions}; {about["machine"]},
+        {about["workers"]} runs at a time, threads each: {about.get("threads", 1)}; {len(study.curves)}
+        runs, {hours:.1f} hours of one core in training; which run is of which commit is in `runs.csv`).
         Draw again: `python benchmarks/plot.py {STUDY}`.""")
     rule = prose("""Two methods are compared by the difference of their interquartile means
         over seeds, with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the
         side that the paper claims. *Different*: on the other side. *Not confirmed*: it contains zero.
         That something gains nothing is confirmed if the whole interval lies below a margin. Counts of
-        seeds are compared by Fisher's exact test at 5 %. The paper's returns are not comparable in
-        size: it gives neither velocity limit nor episode length.""")
+        seeds are compared by Fisher's exact test, 2.5 % on either side. The paper's returns are not
+        comparable in size: it gives neither velocity limit nor episode length.""")
     tuned = prose("""Every family of methods tried the same changes of the same settings with
         the same seeds, which are not those above; the winner of a family is used for all its methods
         (`TUNED` in `benchmarks/comparison/methods.py`). So the claims compare methods at their own best;
@@ -152,13 +158,14 @@ def robot_section(name: str, study: Study) -> str:
         found with augmentation and are used for all methods; none was tuned by itself.""")
     if any(parts(method)[1] for method in study.methods(task)):
         made += "\n\n" + prose("""Of the weights of the mirror loss, the one whose first seed had the
-            highest return, in the mean of all evaluations, got all seeds.""")
+            highest return with mean actions, in the mean of all evaluations, got all seeds.""")
     if about.get("unfinished"):
         made += "\n\n" + prose(f"""**Still in progress**: {len(about["unfinished"])} runs of this comparison
             have not been made yet. The same command makes them.""")
     made += "\n\n" + prose("""Verdicts on fewer than five seeds say so: with three, where two methods do not
         differ, one in ten is *confirmed* by chance, with five one in thirty; a single seed has no interval
-        and decides nothing.""")
+        and decides nothing. Seconds are those of runs at different times, on a machine whose speed is not
+        always the same: steps compare methods, seconds say how long to wait.""")
     if name in REMARKS:
         made += "\n\n" + prose(REMARKS[name])
     judged = "\n".join(
@@ -199,8 +206,8 @@ def readme_block(study: Study) -> str:
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
     seeds = " to ".join(map(str, sorted({len(study.seeds("cartpole", m)) for m in README_METHODS})))
     text = prose(f"""The two sides differ by more than {claims.SWING:g} in {one_sided} seeds of
-        plain PPO: it swings the pole all the way round, or not up at all, from one of them. With
-        symmetric copies the worst of {len(copies)} seeds differs by {copies.max():.3f}. Every claim of
+        plain PPO: from one of them it swings the pole up by a detour. With symmetric copies the worst of
+        {len(copies)} seeds differs by {copies.max():.3f}. Every claim of
         the paper with evidence and verdict, also those that do not hold here:
         [results](docs/results.md).""")
     head = f"After {steps:.1f} million steps, {seeds} seeds per method:"

@@ -112,11 +112,12 @@ def table(results: study.Study) -> str:
             rivals = [means[f, o].mean() for o in candidates if len(means[f, o]) == most]
             text = f"{means[f, c].mean():.3f} ({seeds})"
             lines[-1].append(f"**{text}**" if seeds == most and means[f, c].mean() == max(rivals) else text)
-    text = f"Made by `{results.about['command']}` ({results.about['revision']}): mean evaluated return of "
+    commits = ", ".join(results.about["revisions"])
+    text = f"Made by `{results.about['command']}` ({commits}): mean evaluated return of {task} and, in "
     text += (
-        f"{task} and, in brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the "
+        f"brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the best {KEPT} of "
     )
-    text += f"best {KEPT} of a family got {len(MORE)} more. Bold: the winner among those.\n\n"
+    text += f"a family got {len(MORE)} more. Bold: the winner among those.\n\n"
     return text + markdown(lines)
 
 

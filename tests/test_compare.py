@@ -199,6 +199,9 @@ def test_presets():
         assert sum(method.startswith("loss-") for method in seeds) == weights
         assert sorted(seeds.values()) == [1] * (weights - 1) + 5 * [robot_seeds]
         assert len({run.setting.frames for run in robot}) == 1, "equal steps for all methods"
+    headings = runs("paper-repose-yaw")
+    assert {run.folder for run in headings} < folders[2]
+    assert collections.Counter(run.method for run in headings) == {"ppo": 3, "aug": 3}
 
 
 def test_tuning_gives_every_family_the_same(tmp_path):

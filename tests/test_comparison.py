@@ -127,6 +127,14 @@ def test_efficiency_by_hand():
     assert own.tolist() == [0.9, 0.5]
     assert tables.seconds_per_step(study, "cartpole", "ppo") == pytest.approx(2e-5)
     assert "| PPO | 1 of 2 | - | - | 50,000 |" in tables.efficiency_table(study, "cartpole")
+    slow = study.curves["cartpole", "ppo", 1]
+    slow["return"], slow["seconds"] = np.array(rising), 3 * slow["seconds"]  # 6 s a point
+    assert tables.crossings(study, "cartpole", "ppo", -1.0).tolist() == [[0.9, 18.0], [0.9, 54.0]]
+    # Of steps and of seconds each the median; seconds per step are that of all intervals together.
+    assert "| PPO | 2 of 2 | 0.90 | 36 | 25,000 |" in tables.efficiency_table(study, "cartpole")
+    study.curves["cartpole", "ppo", 1] = {name: values[:3] for name, values in slow.items()}
+    reached = tables.crossings(study, "cartpole", "ppo", -1.0).tolist()
+    assert reached == [[0.9, 18.0], [math.inf, math.inf]], "too short to be smoothed"
 
 
 def test_table_1_by_hand():
@@ -164,6 +172,9 @@ def test_verdicts_follow_the_interval():
     assert verdicts.more((10, 10), (2, 10)) == "confirmed"
     assert verdicts.more((2, 10), (10, 10)) == "different"
     assert verdicts.more((10, 10), (9, 10)) == "not confirmed"
+    assert verdicts.more((5, 10), (0, 10)) == "confirmed", "p = 0.016"
+    assert verdicts.more((4, 10), (0, 10)) == "not confirmed", "p = 0.043, on one side"
+    assert verdicts.more((3, 4), (1, 4)) == "not confirmed (4 seeds)"
     assert verdicts.joined(return_="a", speed="a") == "a"
     assert verdicts.joined(than_PPO="a", speed="b") == "than PPO: a, speed: b"
 
@@ -171,8 +182,8 @@ def test_verdicts_follow_the_interval():
 # Per method: evaluated returns of both sides, the point at which training gets there, symmetry loss.
 PAPER_IS_RIGHT = {
     "ppo": (-1.4, -3.4, 10, 10.0),
-    "loss-0.1": (-1.8, -2.3, 8, 1.0),
-    "loss-1": (-1.8, -2.2, 10, 0.1),
+    "loss-0.1": (-2.4, -2.9, 11, 1.0),
+    "loss-1": (-2.6, -3.0, 12, 0.1),
     "loss-10": (-4.0, -4.2, 16, 0.01),
     "aug": (-1.3, -1.3, 3, 0.001),
     "aug+loss-0.1": (-1.3, -1.3, 3, 0.001),
@@ -185,8 +196,8 @@ PAPER_IS_RIGHT = {
 }
 PAPER_IS_WRONG = {
     "ppo": (-1.3, -1.3, 6, 0.001),
-    "loss-0.1": (-1.3, -1.3, 6, 0.01),
-    "loss-1": (-1.3, -1.3, 6, 0.1),
+    "loss-0.1": (-1.2, -1.2, 5, 0.01),
+    "loss-1": (-1.2, -1.2, 4, 0.1),
     "loss-10": (-1.1, -1.1, 2, 1.0),
     "aug": (-1.4, -3.4, 14, 10.0),
     "aug+loss-0.1": (-1.2, -1.2, 5, 0.1),
@@ -246,13 +257,14 @@ def test_results_survive_writing_and_reading(tmp_path):
     stored = run.result()
     other = dataclasses.replace(run, seed=7, setting=setting.replace(seed=7), folder=tmp_path / "other")
     other.folder.mkdir()
-    elsewhere = {"machine": "elsewhere", "versions": stored["versions"] | {"torch": "0"}, "revision": "r"}
-    write_json(other.folder / "result.json", stored | other.request() | elsewhere)
+    (here,) = stored["origins"]
+    elsewhere = {"machine": "elsewhere", "versions": here["versions"] | {"torch": "0"}, "revision": "r"}
+    write_json(other.folder / "result.json", stored | other.request() | {"origins": [elsewhere]})
     write(tmp_path / "results", [run, other], [], {"workers": 1})
     about = read(tmp_path / "results").about
-    assert about["machine"] == " / ".join(sorted([stored["machine"], "elsewhere"]))
-    assert about["versions"] == stored["versions"] | {"torch": f"0 / {torch.__version__}"}
-    assert about["revisions"] == sorted([stored["revision"], "r"])
+    assert about["machine"] == " / ".join(sorted([here["machine"], "elsewhere"]))
+    assert about["versions"] == here["versions"] | {"torch": f"0 / {torch.__version__}"}
+    assert about["revisions"] == sorted([here["revision"], "r"])
     # Asked for something else, it counts as not done, and its folder is refused.
     assert dataclasses.replace(run, episodes=3).result() is None
     longer = dataclasses.replace(run, setting=setting.replace(iterations=3))

@@ -8,6 +8,7 @@ import pytest
 import plot
 import results_page
 from comparison import robot_claims, robot_tables, tables, verdicts
+from comparison.methods import label
 from comparison.study import Study
 from tests.test_comparison import PAPER_IS_RIGHT, world
 
@@ -200,8 +201,13 @@ def test_robots_are_drawn_and_described_also_beside_other_tasks(tmp_path, monkey
     del study.curves["robot", "loss-1", 0]  # its rows stay: it diverged at once
     both = Study(about, cartpole.runs + study.runs, cartpole.curves | study.curves)
     assert plot.phases(both).axes[0].get_title() == "robot: PPO"
-    for figure in (plot.success(both), plot.goals(both), plot.efficiency(both)):
+    figures = plot.success(both), plot.goals(both), plot.efficiency(both)
+    for figure in figures:
         figure.savefig(tmp_path / "figure.png")
+    shown = [text.get_text() for text in figures[1].axes[1].get_xticklabels()]
+    assert shown == [label(method) for method in study.methods("robot")]
+    shown = {text.get_text() for text in figures[2].axes[1].get_legend().get_texts()}
+    assert shown == {label(method) for method in study.methods("robot")}
     text = robot_tables.tables(both)
     assert text.count("Mean actions:") == 1 and "nan" not in text
     monkeypatch.setitem(results_page.ROBOTS, "paper-robot", ("robot", "A robot"))

@@ -10,6 +10,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+import results_page
+from comparison import study
+from comparison.robot_tables import tables
 from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -112,14 +115,17 @@ def test_the_page_about_the_tasks_is_what_the_code_says(tmp_path):
 
 
 def test_figures_and_pages_follow_from_the_stored_results(tmp_path):
+    advice = "run python benchmarks/plot.py and benchmarks/results_page.py"
     run("benchmarks/plot.py", "paper-cartpole-20", "--plots", tmp_path / "plots")
     drawn, stored = tmp_path / "plots/paper-cartpole-20", ROOT / "benchmarks/plots/paper-cartpole-20"
-    assert (drawn / "tables.md").read_text() == (stored / "tables.md").read_text()
+    assert (drawn / "tables.md").read_text() == (stored / "tables.md").read_text(), advice
     assert {path.name for path in drawn.iterdir()} == {path.name for path in stored.iterdir()}
+    for name in results_page.ROBOTS:
+        text = tables(study.read(ROOT / "benchmarks/results" / name))
+        assert (ROOT / "benchmarks/plots" / name / "tables.md").read_text() == text, advice
     readme = tmp_path / "README.md"
     readme.write_text(re.sub(r"(?<=-->\n)\|?[^<]*(?=<!-- end)", "", (ROOT / "README.md").read_text()))
     run("benchmarks/results_page.py", "--docs", tmp_path, "--readme", readme)
-    advice = "run python benchmarks/plot.py and benchmarks/results_page.py"
     assert (tmp_path / "results.md").read_text() == (ROOT / "docs/results.md").read_text(), advice
     assert readme.read_text() == (ROOT / "README.md").read_text(), advice
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-RESAMPLES = 2000
+RESAMPLES = 20_000  # an end of an interval that a verdict hangs on moves by a fiftieth of its width
+BAND_RESAMPLES = 2000  # at every point of a curve
 
 
 @dataclass(frozen=True)
@@ -41,16 +42,16 @@ def estimate(values: np.ndarray) -> Estimate:
     value = float(iqm(values))
     if len(values) < 2:
         return Estimate(value, -math.inf, math.inf)
-    low, high = band(np.asarray(values, dtype=float)[:, None])
+    low, high = band(np.asarray(values, dtype=float)[:, None], RESAMPLES)
     return Estimate(value, float(low[0]), float(high[0]), len(values))
 
 
-def band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def band(values: np.ndarray, resamples: int = BAND_RESAMPLES) -> tuple[np.ndarray, np.ndarray]:
     """Interval of the interquartile mean over seeds at every point, ``(seeds, points)``."""
     if len(values) < 2:
         return values[0], values[0]
     result = stats.bootstrap(
-        (values,), iqm, axis=0, n_resamples=RESAMPLES, method="percentile", vectorized=True, rng=0
+        (values,), iqm, axis=0, n_resamples=resamples, method="percentile", vectorized=True, rng=0
     )
     return result.confidence_interval.low, result.confidence_interval.high
 

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 from tqdm import tqdm
 
+from comparison.provenance import origin
 from comparison.run import Run
 
 POLL = 0.5  # seconds between two looks at the runs' files
@@ -24,6 +25,7 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
     """Execute what is not finished, at most `workers` at a time; returns the runs that failed."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torchrl_sym.recipes", "tasks.evaluation", "tyro", "tqdm"])
+    code = origin()  # that which the server loads now, whatever is committed while runs wait
     waiting = [run for run in runs if run.result() is None]
     active: dict[int, tuple[Run, multiprocessing.Process, tqdm]] = {}  # by line on the screen
     failed: list[Run] = []
@@ -36,7 +38,7 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
         while waiting or active:
             for line in range(1, workers + 1):
                 if waiting and line not in active:
-                    active[line] = _start(context, waiting.pop(0), line)
+                    active[line] = _start(context, waiting.pop(0), line, code)
             time.sleep(POLL)
             for line, (run, process, own) in list(active.items()):
                 done, latest = run.progress()
@@ -62,8 +64,8 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
     return failed
 
 
-def _start(context, run: Run, line: int) -> tuple[Run, multiprocessing.Process, tqdm]:
-    process = context.Process(target=_work, args=(run,), name=str(run))
+def _start(context, run: Run, line: int, code: dict) -> tuple[Run, multiprocessing.Process, tqdm]:
+    process = context.Process(target=_work, args=(run, code), name=str(run))
     process.start()
     own = tqdm(total=run.iterations, initial=run.progress()[0], position=line, leave=False, disable=None)
     own.set_description(str(run))
@@ -82,7 +84,7 @@ def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
     return f"{returns} ({result['seconds']:.0f} s)"
 
 
-def _work(run: Run) -> None:
+def _work(run: Run, code: dict) -> None:
     """The life of a worker: all it prints goes to its log."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     run.folder.mkdir(parents=True, exist_ok=True)
@@ -90,7 +92,7 @@ def _work(run: Run) -> None:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
     try:
-        run.execute()
+        run.execute(code)
     except Exception:
         traceback.print_exc()
         sys.exit(1)

@@ -14,11 +14,6 @@ import torch
 import torchrl
 
 
-def provenance() -> dict[str, Any]:
-    """What has to be known to repeat a result."""
-    return {"command": command()} | origin()
-
-
 def origin() -> dict[str, Any]:
     """The code that runs here: its commit, versions and machine."""
     return {

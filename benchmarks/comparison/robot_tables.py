@@ -8,15 +8,15 @@ from comparison.study import Study
 from comparison.tables import (
     chance_variation,
     efficiency_table,
+    last_symmetry_loss,
     markdown,
     seconds_per_step,
     seeds_of,
-    symmetry_loss,
     table_1,
     variation,
 )
 
-ACTIONS = {"deterministic": "mean actions", "sampled": "sampled actions, as in training"}
+TITLES = {"deterministic": "mean actions", "sampled": "sampled actions, as in training"}
 
 
 def tables(study: Study) -> str:
@@ -35,7 +35,7 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
     """A table per evaluation and kind of actions."""
     text = ""
     for what in study.evaluations(task):
-        for actions, name in ACTIONS.items():
+        for actions, name in TITLES.items():
             title = name if what == "task" else f"{what}, {name}"
             text += f"{title[0].upper()}{title[1:]}:\n\n"
             text += success_table(study, task, methods, actions, what) + "\n"
@@ -45,8 +45,8 @@ def success_tables(study: Study, task: str, methods: list[str] | None = None) ->
         "*spread*: the largest difference between a seed's goals. Starts are paired, so that an\n"
         "equivariant policy differs by nothing; another policy, or sampled actions, differ also by\n"
         "*chance*: by about so many points if all goals are alike and episodes independent. *task\n"
-        "return*: without terms of gait and effort. *turning*: yaw travelled in an episode. *symmetry\n"
-        "loss*: as in the paper, on the states of the last iteration.\n"
+        "return*: without terms of gait and effort. *turning*: yaw travelled in an episode, where a task\n"
+        "measures it. *symmetry loss*: as in the paper, on the states of the last iteration.\n"
     )
 
 
@@ -93,7 +93,7 @@ def success_row(
         if np.isfinite(figures[column]).all():
             row[name] = estimate(figures[column].mean(axis=1)).format(2)
             row[f"spread of {name}"] = estimate(variation(figures[column])).format(2)
-    row["symmetry loss"] = symmetry_loss(study, task, method)
+    row["symmetry loss"] = last_symmetry_loss(study, task, method)
     if np.isfinite(figures["turning"]).any():
         row["turning [rad]"] = estimate(figures["turning"].mean(axis=1)).format(2)
     return row

@@ -33,7 +33,7 @@ from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train
 
 EVALUATION_SEED = 1000  # the same starts for every run
 MAX_STEPS = 10_000  # of an episode in evaluation
-ACTIONS = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
+EXPLORATION = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
 
 
 @dataclass(frozen=True)
@@ -94,8 +94,11 @@ class Run:
         """Iterations in all."""
         return sum(stage.config.iterations for stage in self.setting.stages)
 
-    def execute(self) -> None:
+    def execute(self, code: dict[str, Any] | None = None) -> None:
         """Train and evaluate, from wherever the folder is; other processes on the same folder wait.
+
+        Args:
+            code: `origin` when the code of this process was loaded; now, by default.
 
         Raises:
             ValueError: the folder holds a run that was asked for differently.
@@ -104,22 +107,27 @@ class Run:
         with (self.folder / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if self.result() is None:
-                self._claim_folder()
-                self._execute()
+                self._execute(self._claim_folder(code or origin()))
 
-    def _claim_folder(self) -> None:
-        """What is continued must have begun as the same run: its past decides its future."""
+    def _claim_folder(self, code: dict[str, Any]) -> list[dict[str, Any]]:
+        """What is continued must have begun as the same run: its past decides its future.
+
+        Returns all code that it has been trained with, an origin each.
+        """
         asked = {key: self.request()[key] for key in ("task", "method", "seed", "stages")}
         path = self.folder / "request.json"
         begun = _read(path)
-        if begun and begun != asked:
+        if begun and any(begun.get(key) != value for key, value in asked.items()):
             raise ValueError(
                 f"expected {self.folder} to be new or to hold {self} as it is asked for now, got a run "
                 "with other settings (request.json); use another --name, or delete the folder"
             )
-        write_json(path, asked)
+        origins = begun.get("origins", [])
+        origins += [code] * (code not in origins)
+        write_json(path, asked | {"origins": origins})
+        return origins
 
-    def _execute(self) -> None:
+    def _execute(self, origins: list[dict[str, Any]]) -> None:
         torch.set_num_threads(self.threads)
         make_env = environment(self.task, self.threads)
         outcome = "finished"
@@ -135,7 +143,7 @@ class Run:
             "seconds": curve[-1]["seconds"] if curve else 0.0,
             "evaluation": self._evaluate(make_env),
         }
-        write_json(self.folder / "result.json", self.request() | origin() | ended)
+        write_json(self.folder / "result.json", self.request() | {"origins": origins} | ended)
 
     def _evaluate(self, make_env: Callable[..., EnvBase]) -> list[dict[str, Any]]:
         """One row per evaluated task, kind of actions and goal; none if it diverged before a checkpoint."""
@@ -146,7 +154,7 @@ class Run:
         for what, kwargs in self.setting.evaluations.items():
             env = make_env(num_envs=1, seed=EVALUATION_SEED, **kwargs)
             actor = load_actor(checkpoint, env, env.symmetry)
-            for actions, exploration in ACTIONS.items():
+            for actions, exploration in EXPLORATION.items():
                 if isinstance(env, BatchedEnv):
                     threads = {"num_threads": self.threads, "exploration": exploration}
                     outcome = evaluate(env, actor, self.episodes, seed=EVALUATION_SEED, **threads)

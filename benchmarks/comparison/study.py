@@ -2,7 +2,7 @@
 
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
-* `study.json`: command, commit, versions, machine; hyper-parameters per task and method; what failed.
+* `study.json`: command, commits, versions, machines; hyper-parameters per task and method; what failed.
 * `policies/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
   succeed or fail; `examples/watch.py` and `behaviour.py` read it.
 """
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from comparison.provenance import joint_origin, provenance
+from comparison.provenance import command, joint_origin, revision
 from comparison.run import Run, last_checkpoint, read_curve, write_json
 from torchrl_sym.recipes import export_actor
 
@@ -50,7 +50,6 @@ def write(
     """
     folder.mkdir(parents=True, exist_ok=True)
     evaluated, curves, methods, origins, episodes = [], [], {}, [], set()
-    here = provenance()
     best: dict[tuple[str, str], list[tuple[float, Run]]] = {}
     unfinished: list[str] = []
     for run in runs:
@@ -61,6 +60,7 @@ def write(
         name = dict(zip(RUN, (run.task, run.method, run.seed), strict=True))
         ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
         ended["outcome"] = ended["outcome"].split(":")[0]
+        ended["revision"] = " ".join(each["revision"] for each in result["origins"])
         rows = result["evaluation"] or [{}]
         episodes.add(result["episodes"])
         evaluated += [name | ended | row for row in rows]
@@ -73,18 +73,19 @@ def write(
         )  # not of what there is: all seeds keep the same iterations
         kept = [row for number, row in enumerate(curve, 1) if number % every == 0 or number == len(curve)]
         curves += [name | row for row in kept]
-        origins.append({key: result.get(key, here[key]) for key in ("revision", "versions", "machine")})
+        origins += result["origins"]
         methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
     for runs_of_method in best.values():
         _, run = max(runs_of_method, key=lambda pair: pair[0])
         checkpoint = last_checkpoint(run.folder)
         assert checkpoint is not None, "it was evaluated"
         export_actor(checkpoint, policy_folder(folder, run.task) / run.method)
-    first = (*RUN, "outcome", "frames", "seconds", *EVALUATION)
+    first = (*RUN, "outcome", "revision", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
-    about = here | joint_origin(origins) | {"episodes": sorted(episodes)} | about
+    collected = {"command": command(), "collected_at": revision(), "episodes": sorted(episodes)}
+    about = collected | joint_origin(origins) | about
     about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
     write_json(folder / "study.json", about)
 
@@ -166,7 +167,7 @@ class Study:
     def with_progress(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
         """Columns of a method's curves as far as `progress` goes, by seed; see :meth:`curve`."""
         stages = self.about["methods"].get(task, {}).get(method) or []
-        return {seed: with_progress(c, stages) for seed, c in self.curves_of(task, method).items()}
+        return {seed: add_progress(c, stages) for seed, c in self.curves_of(task, method).items()}
 
     def evaluations(self, task: str) -> list[str]:
         """What was evaluated after training on a task, in order."""
@@ -219,7 +220,7 @@ def has_curriculum(curve: dict[str, np.ndarray]) -> bool:
     return all(np.isfinite(curve.get(name, np.nan)).any() for name in ("level", "success"))
 
 
-def with_progress(curve: dict[str, np.ndarray], stages: list[dict[str, Any]]) -> dict[str, np.ndarray]:
+def add_progress(curve: dict[str, np.ndarray], stages: list[dict[str, Any]]) -> dict[str, np.ndarray]:
     """A run's curve, as long as there is a curriculum, with a column `progress`; see `Study.curve`.
 
     Args:

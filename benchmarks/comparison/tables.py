@@ -24,7 +24,7 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
         comparable = returns.shape[1] > 1
         row += [estimate(returns.mean(axis=1)).format()]
         row += [estimate(variations).format(), f"{variations.max():.3f}"] if comparable else ["-", "-"]
-        rows.append([*row, symmetry_loss(study, task, method)])
+        rows.append([*row, last_symmetry_loss(study, task, method)])
     note = (
         "*return*: mean over the equivalent goals, mean actions; *variation*: the largest difference\n"
         "between two goals; both as interquartile mean over seeds with its 95 % bootstrap interval.\n"
@@ -42,8 +42,8 @@ def seeds_of(study: Study, task: str, method: str) -> str:
     return f"{seeds} ({gone} diverged, {missing} at once)" if gone else str(seeds)
 
 
-def symmetry_loss(study: Study, task: str, method: str) -> str:
-    """Interquartile mean of the logarithm, at the end of training."""
+def last_symmetry_loss(study: Study, task: str, method: str) -> str:
+    """Interquartile mean of the logarithm at the end of training, as text."""
     curves = study.curve(task, method, "mirror_loss")[1]
     return f"{np.exp(iqm(np.log(np.maximum(curves[:, -1], 1e-12)))):.2g}" if len(curves) else "-"
 
@@ -60,17 +60,15 @@ def efficiency_table(study: Study, task: str) -> str:
     rows = [["method", "reached", "million steps, median", "seconds, median", "steps per second"]]
     rows.append(["---", *["---:"] * 4])
     for method in study.methods(task):
-        reached = steps_to(study, task, method, goal)
-        cost = seconds_per_step(study, task, method)
-        middle = np.median(reached) if len(reached) else np.inf
-        known = [f"{middle:.2f}", f"{middle * 1e6 * cost:.0f}"] if np.isfinite(middle) else ["-", "-"]
-        count = f"{np.isfinite(reached).sum()} of {len(reached)}"
-        rows.append([label(method), count, *known, f"{1 / cost:,.0f}"])
+        steps, seconds = np.median(crossings(study, task, method, goal), axis=0)
+        known = [f"{steps:.2f}", f"{seconds:.0f}"] if np.isfinite(steps) else ["-", "-"]
+        count = "{} of {}".format(*reached(study, task, method))
+        rows.append([label(method), count, *known, f"{1 / seconds_per_step(study, task, method):,.0f}"])
     note = (
         f"Until the {measured(study, task)}, averaged over {SMOOTHING} logged iterations, "
         f"reaches {goal:.2f}: {SHARE:.0%} of\n"
         "the way from its first value to the best method's last. Seeds that never do count as infinite in\n"
-        "the median. One process with one thread per run.\n"
+        f"the median. A process of its own per run, threads: {study.about.get('threads', 1)}.\n"
     )
     return markdown(rows) + "\n" + note
 
@@ -114,13 +112,29 @@ def threshold(study: Study, task: str) -> float:
 
 def steps_to(study: Study, task: str, method: str, goal: float) -> np.ndarray:
     """Million steps at which each seed's smoothed progress first reaches a value; inf if never."""
-    steps, values = study.curve(task, method, "progress")
-    never = np.full(len(study.seeds(task, method)), np.inf)
-    if len(steps) < SMOOTHING:
-        return never
-    there = smooth(values) >= goal
-    reached = np.where(there.any(axis=1), steps[SMOOTHING - 1 :][there.argmax(axis=1)], np.inf)
-    return np.concatenate([reached, never[len(reached) :]])
+    return crossings(study, task, method, goal)[:, 0]
+
+
+def crossings(study: Study, task: str, method: str, goal: float) -> np.ndarray:
+    """Million steps and seconds of training at which each seed gets to a progress, ``(seeds, 2)``."""
+    curves = study.with_progress(task, method)
+    found = [_crossing(curves.get(seed), goal) for seed in study.seeds(task, method)]
+    return np.array(found).reshape(-1, 2)
+
+
+def _crossing(curve: dict[str, np.ndarray] | None, goal: float) -> tuple[float, float]:
+    if curve is not None and len(curve["frames"]) >= SMOOTHING:
+        there = smooth(curve["progress"][None])[0] >= goal
+        if there.any():
+            at = there.argmax() + SMOOTHING - 1
+            return curve["frames"][at] / 1e6, curve["seconds"][at]
+    return np.inf, np.inf
+
+
+def reached(study: Study, task: str, method: str) -> tuple[int, int]:
+    """How many seeds reach the threshold, and how many there are."""
+    found = np.isfinite(steps_to(study, task, method, threshold(study, task)))
+    return int(found.sum()), len(found)
 
 
 def steps_to_own(study: Study, task: str, method: str) -> np.ndarray:

@@ -3,8 +3,8 @@
 Two methods are compared by the difference of interquartile means over seeds and its 95 % bootstrap
 interval: *confirmed* if the interval lies on the claimed side of zero, *different* if it lies on the other
 side, *not confirmed* if it contains zero. That something gains nothing is confirmed if the whole interval
-is below a margin. Counts of seeds are compared by Fisher's exact test at 5 %. A verdict on fewer than five
-seeds says on how many.
+is below a margin. Counts of seeds are compared by Fisher's exact test, at 2.5 % on either side like the
+intervals. A verdict on fewer than five seeds says on how many.
 """
 
 import math
@@ -18,7 +18,7 @@ from scipy import stats
 from comparison.intervals import Estimate, difference, iqm
 from comparison.methods import label
 from comparison.study import LAST_PHASE, Study
-from comparison.tables import SHARE, SMOOTHING, smooth, steps_to, threshold, variation
+from comparison.tables import SHARE, SMOOTHING, reached, smooth, steps_to, threshold, variation
 
 Judgement = tuple[str, str]  # evidence, verdict
 # Verdicts on fewer seeds say so: where two methods do not differ, one in ten is confirmed by chance with
@@ -73,8 +73,8 @@ def symmetry_loss(study: Study, method: str, *, task: str) -> np.ndarray:
 
 def steps(study: Study, method: str, *, task: str) -> np.ndarray:
     """Million steps to the threshold; seeds that never reach it count as the whole curve."""
-    reached = steps_to(study, task, method, threshold(study, task))
-    return np.minimum(reached, study.curve(task, method, "progress")[0][-1])
+    found = steps_to(study, task, method, threshold(study, task))
+    return np.minimum(found, study.curve(task, method, "progress")[0][-1])
 
 
 def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
@@ -100,8 +100,7 @@ def recovery(study: Study, method: str, *, task: str) -> np.ndarray:
 
 def counted(study: Study, method: str, *, task: str) -> str:
     """How many seeds of a method reach the threshold, as text."""
-    reached = steps_to(study, task, method, threshold(study, task))
-    return f"{label(method)} {np.isfinite(reached).sum()} of {len(reached)}"
+    return "{} {} of {}".format(label(method), *reached(study, task, method))
 
 
 def verdict(claimed_positive: Estimate) -> str:
@@ -109,8 +108,8 @@ def verdict(claimed_positive: Estimate) -> str:
     if not math.isfinite(claimed_positive.low):
         return "undecided"
     if claimed_positive.low > 0:
-        return _of_seeds("confirmed", claimed_positive)
-    return _of_seeds("different" if claimed_positive.high < 0 else "not confirmed", claimed_positive)
+        return _of_seeds("confirmed", claimed_positive.seeds)
+    return _of_seeds("different" if claimed_positive.high < 0 else "not confirmed", claimed_positive.seeds)
 
 
 def no_gain(gain: Estimate, margin: float) -> str:
@@ -118,20 +117,20 @@ def no_gain(gain: Estimate, margin: float) -> str:
     if not math.isfinite(gain.low):
         return "undecided"
     if gain.high < margin:
-        return _of_seeds("confirmed", gain)
-    return _of_seeds("different" if gain.low > 0 else "not confirmed", gain)
+        return _of_seeds("confirmed", gain.seeds)
+    return _of_seeds("different" if gain.low > 0 else "not confirmed", gain.seeds)
 
 
-def _of_seeds(outcome: str, gap: Estimate) -> str:
-    return outcome if gap.seeds >= FEW else f"{outcome} ({gap.seeds} seeds)"
+def _of_seeds(outcome: str, seeds: int) -> str:
+    return outcome if seeds >= FEW else f"{outcome} ({seeds} seeds)"
 
 
 def more(a: tuple[int, int], b: tuple[int, int]) -> str:
     """The rule for counts, of a total each, of which the paper says the first is larger."""
     table = [[a[0], a[1] - a[0]], [b[0], b[1] - b[0]]]
-    if stats.fisher_exact(table, alternative="greater").pvalue < 0.05:
-        return "confirmed"
-    return "different" if stats.fisher_exact(table, alternative="less").pvalue < 0.05 else "not confirmed"
+    larger, smaller = (stats.fisher_exact(table, alternative=side).pvalue for side in ("greater", "less"))
+    outcome = "confirmed" if larger < 0.025 else "different" if smaller < 0.025 else "not confirmed"
+    return _of_seeds(outcome, min(a[1], b[1]))
 
 
 def pair(study: Study, what: Callable, a: str, b: str, digits: int = 3) -> tuple[str, Estimate]:
