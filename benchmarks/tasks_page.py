@@ -29,8 +29,9 @@ DOCS = Path(__file__).parents[1] / "docs"
 HEADER = """# Tasks
 
 Made from the code by `python benchmarks/tasks_page.py`; with `--pictures` it also draws the start states
-of all goals. (`python examples/watch.py TASK --checkpoint FOLDER --out docs/tasks_TASK.png` draws key
-frames of a policy instead.) Build a task by `tasks.make_env(name, num_envs=..., **arguments)`.
+of all goals. (`python examples/watch.py TASK --checkpoint FOLDER --out TASK.png` draws key frames of a
+policy.) Build a task by `tasks.make_env(name, num_envs=..., **arguments)`, or as a dm_control environment
+by `tasks.load(name, **arguments)`; scripts take `--task-kwargs NAME VALUE ...`.
 
 Every task has one goal per element of its symmetry group. The canonical goal is the first; the start of
 every other is its image, so that all are equally hard. *Observation*: the column *transforms* says how the

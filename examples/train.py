@@ -1,6 +1,7 @@
 """Train a task from the command line, with its own settings: `python examples/train.py --help`.
 
-    python examples/train.py anymal_push --folder runs/push --config.augmentation all
+    python examples/train.py anymal_push --folder runs/push
+    python examples/train.py anymal_climb --folder runs/low --task-kwargs height 0.2 phase C
 
 The run can be killed and started again: it continues where its last checkpoint was. Settings of several
 stages are trained in order, the last in the folder itself, those before it in `stage_0`, ...; what is
@@ -11,7 +12,7 @@ import dataclasses
 import functools
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 import tyro
@@ -30,8 +31,8 @@ class Arguments:
     """What to train."""
     config: PPOConfig
     """Hyper-parameters."""
-    task_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Arguments of the task in training."""
+    task_kwargs: dict[str, int | float | bool | str] = field(default_factory=dict)
+    """Arguments of the task (docs/tasks.md), such as: height 0.2 phase C. Evaluations keep theirs."""
     folder: Path = Path("runs/train")
     """Where metrics.csv and checkpoint.pt go."""
     logger: Literal["csv", "tensorboard", "wandb"] = "csv"
@@ -47,8 +48,7 @@ def main(arguments: Arguments) -> None:
     setting = SETTINGS[arguments.task]
     before, asked = dataclasses.asdict(setting.config), dataclasses.asdict(arguments.config)
     changes = {name: value for name, value in asked.items() if value != before[name]}
-    default = setting.task
-    kwargs = {k: v for k, v in arguments.task_kwargs.items() if k not in default or v != default[k]}
+    kwargs = arguments.task_kwargs
     make_env = functools.partial(tasks.make_env, arguments.task, num_threads=arguments.threads)
     stages = setting.replace(**changes).stages
     earlier = None
@@ -61,7 +61,7 @@ def main(arguments: Arguments) -> None:
             pass
         earlier = folder
     for what, evaluated in setting.evaluations.items():
-        env = make_env(num_envs=1, seed=0, **evaluated)
+        env = make_env(num_envs=1, seed=0, **kwargs | evaluated)
         result = evaluate(env, load_actor(arguments.folder, env, env.symmetry), arguments.episodes)
         print(f"{what}: mean return {result.mean:.3f}, variation {result.variation:.3f}")
         for goal, value in result.goal_means.items():
@@ -71,7 +71,6 @@ def main(arguments: Arguments) -> None:
 
 if __name__ == "__main__":
     choices = {
-        name: (f"train {name}", Arguments(name, setting.config, dict(setting.task)))
-        for name, setting in SETTINGS.items()
+        name: (f"train {name}", Arguments(name, setting.config)) for name, setting in SETTINGS.items()
     }
     main(tyro.extras.overridable_config_cli(choices))

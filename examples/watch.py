@@ -6,7 +6,7 @@ Episodes are paired: every goal starts from the image of one and the same state.
 actions are random and mirrored too, so the pictures are exact mirror images: the symmetry of the task.
 With one, differences are the policy's own.
 
-The suffix of --out decides: .gif or .mp4 (pip install 'torchrl_sym[video]') a film, goals side by
+The suffix of --out decides: .gif or .mp4 (pip install imageio imageio-ffmpeg) a film, goals side by
 side, .png a strip of key frames, one row per goal. With --overlay, a .png of all paths from above instead.
 """
 
@@ -49,8 +49,8 @@ class Arguments:
     """Of the start state and of random actions."""
     stochastic: bool = False
     """Sample the policy's actions."""
-    task_kwargs: dict[str, float] = field(default_factory=dict)
-    """Numbers that the task is made with, such as: yaw 3.14."""
+    task_kwargs: dict[str, int | float | bool | str] = field(default_factory=dict)
+    """Arguments of the task (docs/tasks.md), such as: yaw 3.14 difficulty 2."""
     overlay: bool = False
     """Draw the paths of everything that moves freely from above, instead of a film."""
     frames: int = 5

@@ -192,7 +192,7 @@ def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.
     """Write a picture or a film; the suffix decides.
 
     Args:
-        path: ``.png`` (one frame), ``.gif``, or ``.mp4`` (``pip install 'torchrl_sym[video]'``).
+        path: ``.png`` (one frame), ``.gif``, or ``.mp4`` (``pip install imageio imageio-ffmpeg``).
         frames: ``(height, width, 3)`` uint8 each.
         fps: frames per second.
 
@@ -231,7 +231,7 @@ def _save_mp4(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
     except ImportError as error:
         raise ImportError(
             f"expected imageio and imageio-ffmpeg to write {path.name}, got {error}; "
-            "pip install 'torchrl_sym[video]', or write a .gif"
+            "pip install imageio imageio-ffmpeg, or write a .gif"
         ) from error
     even = [frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # h264 wants it
     imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # type: ignore[arg-type]

@@ -56,11 +56,12 @@ class Setting:
 
 # An action of 1 moves a target by 2 rad, a walking robot's by some 0.5 rad: networks put out quarters, and
 # the noise starts at 0.3 rad. The cap of the learning rate is lower than legged_gym's 1e-2: batches are an
-# eighth of its. One random element per sample costs a quarter of the orbit.
+# eighth of its. All copies: one random element per sample costs a quarter of them and learns less
+# (docs/results.md).
 # (With 1024 simulations, half as many updates per step, pushing took twice the steps; a KL of 0.012 was
 # slower, 0.03 fell over at once.)
 _ANYMAL = PPOConfig(
-    augmentation="random",
+    augmentation="all",
     num_envs=512,
     horizon=24,
     epochs=5,
@@ -88,8 +89,7 @@ _PUSH_ON = dataclasses.replace(_PUSH, iterations=60, **_STEADY)  # 0.7 M
 _CLIMB = dataclasses.replace(_ANYMAL, iterations=600)  # 7.4 M
 _CLIMB_ON = dataclasses.replace(_CLIMB, iterations=100, **_STEADY)  # 1.2 M
 
-# Nine torques: noise has to move fingers, hence the large deviation; all copies, since one random element
-# per sample learned more slowly in a prototype.
+# Nine torques: noise has to move fingers, hence the large deviation.
 _REPOSE = PPOConfig(
     augmentation="all",
     iterations=500,  # 4.1 M steps

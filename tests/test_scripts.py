@@ -70,6 +70,10 @@ def test_train_and_continue(tmp_path):
 
 def test_settings_of_several_stages_are_trained_in_order(tmp_path):
     few = ["--episodes", "1", "--config.gamma", "0.9"]
+    changed = ["--task-kwargs", "episode_seconds", "0.5", "yaw", "9.0"]
+    with pytest.raises(AssertionError, match="expected a yaw in"):
+        run("examples/train.py", "trifinger_repose", "--folder", tmp_path, *TINY, *few, *changed)
+    few += changed[:3]
     output = run("examples/train.py", "trifinger_repose", "--folder", tmp_path, *TINY, *few)
     assert re.search(r"difficulty 1: mean return -?\d[^\n]*\n  right .*success", output)
     configs = [RunFolder(folder).load()["config"] for folder in (tmp_path / "stage_0", tmp_path)]
