@@ -221,9 +221,6 @@ def phases(study: Study):
             entered = np.flatnonzero(np.diff(own["phase"]) > 0) + 1
             axis.plot(steps[entered], own["return"][entered], "|", color="black", markersize=9)
         axis.set(title=f"{task}: {label(method)}", xlabel=STEPS)
-    axes[0, 0].set_ylabel("training return, per seed")
-    share_limits(axes[0])
-    for axis, (task, method) in zip(axes[0], shown, strict=True):
         for number, name in enumerate("BC", 1):
             own = [c for c in study.curves_of(task, method).values() if (c["phase"] >= number).any()]
             if own:
@@ -231,6 +228,8 @@ def phases(study: Study):
                 axis.axvline(middle, color="black", linewidth=0.6, linestyle=":")
                 place = (middle, 1.0)
                 axis.annotate(name, place, (2, -9), axis.get_xaxis_transform(), "offset points", fontsize=8)
+    axes[0, 0].set_ylabel("training return, per seed")
+    share_limits(axes[0])
     return figure
 
 
