@@ -27,8 +27,9 @@ import torch
 import tyro
 
 from comparison.methods import label
+from comparison.records import policy_folder
 from comparison.run import environment, task_setting
-from comparison.study import policy_folder, read
+from comparison.study import read
 from plot import color
 from tasks.anymal import LEGS
 from tasks.base import Task, create

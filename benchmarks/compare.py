@@ -9,7 +9,8 @@
 
 Every run is a process of its own with one thread, as many at a time as there are cores. Kill it whenever
 you like: the same command goes on where it was and ends in the same results. A run that fails is reported
-and does not stop the others. Results go to benchmarks/results/NAME as tidy tables; `plot.py` draws them.
+and does not stop the others. Results go to benchmarks/results/NAME as tidy tables; `plot.py` draws them;
+with `--extend`, only what they lack is trained.
 
 Your own task is `--tasks module:function`, a function that takes `num_envs` and `seed` and returns an
 environment with a `symmetry`; hyper-parameters are a `SETTING` in its module, or `--config KEY=VALUE ...`.
@@ -29,6 +30,7 @@ import tyro
 from comparison import provenance, study
 from comparison.methods import METHOD_FIELDS, configure
 from comparison.pool import execute_all
+from comparison.records import EarlierResults
 from comparison.run import Run, task_setting
 from torchrl_sym.recipes import PPOConfig
 
@@ -115,8 +117,10 @@ class Arguments:
     """Evaluation episodes per goal."""
     workers: int = os.cpu_count() or 1
     """Runs at a time."""
+    extend: bool = False
+    """Train only what the results lack: runs that they hold already stay in them as they are."""
     collect: bool = False
-    """Train nothing: write and draw what has been finished so far."""
+    """Train nothing: write and draw what has been finished so far, and what the results hold already."""
     threads: int = 1
     """Threads per run."""
     name: str | None = None
@@ -135,16 +139,22 @@ def main(arguments: Arguments) -> int:
     name = arguments.name or arguments.preset or "custom"
     shared = "paper" if (arguments.preset or "").startswith("paper") else name  # they have runs in common
     runs = make_runs(arguments, arguments.folder / shared)
-    failed = [] if arguments.collect else execute_all(runs, arguments.workers)
+    folder = arguments.output / name
+    earlier = EarlierResults(folder) if arguments.collect or arguments.extend else None
+    known = [run for run in runs if earlier and run.result() is None and earlier.record(run)]
+    wanted = [run for run in runs if run not in known]
+    failed = [] if arguments.collect else execute_all(wanted, arguments.workers)
     for run in failed:
         print(f"FAILED: {run} (see {run.folder / 'log.txt'})")
-    if not any(run.result() for run in runs):
+    if not known and not any(run.result() for run in runs):
         print("no run has been finished; there is nothing to write")
         return 1
     about = {"workers": arguments.workers, "threads": arguments.threads}
-    about["command"] = provenance.command().replace(" --collect", "")  # which makes none of the runs
-    study.write(arguments.output / name, runs, failed, about)
-    for path in plot.draw_all(arguments.output / name, arguments.plots / name):
+    if earlier and len(known) == len(runs):
+        about = {key: earlier.about.get(key, value) for key, value in about.items()}
+    about["command"] = provenance.command().replace(" --collect", "").replace(" --extend", "")
+    study.write(folder, runs, failed, about, earlier=earlier)
+    for path in plot.draw_all(folder, arguments.plots / name):
         print(f"wrote {path}")
     return 1 if failed else 0
 

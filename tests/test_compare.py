@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,10 +21,12 @@ import compare as compare_script
 import tasks
 import tune
 from comparison import claims, methods, study
+from comparison.records import EarlierResults
 from comparison.run import Run
 from tasks.settings import SETTINGS
 
 ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 FIGURES = {"training", "log_prob", "initialization", "goals", "efficiency", "success", "phases"}
 TINY = ["--config", "num_envs=8", "horizon=25", "epochs=1", "minibatches=1", "checkpoint_interval=2"]
 TIMING = ("seconds", "collect_seconds", "physics_seconds")
@@ -128,6 +131,42 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     part = study.read(tmp_path / "results" / "custom")
     assert part.methods("cartpole") == ["ppo"] and part.about["unfinished"] == ["cartpole loss-1 0"]
     assert compare_script.main(dataclasses.replace(asked, methods=("loss-1",))) == 1
+
+
+def test_results_are_extended_where_the_runs_are_gone(tmp_path):
+    what = ["--methods", "ppo", "--steps", str(8 * 25 * 2), *TINY]
+    compare(tmp_path, *what, "--seeds", "1")
+    results = tmp_path / "results" / "custom"
+    before = {path.name: path.read_text() for path in results.iterdir()}
+    shutil.rmtree(tmp_path / "runs")
+    shutil.rmtree(tmp_path / "plots")
+    compare(tmp_path, *what, "--seeds", "1", "--collect")
+    assert before == {path.name: path.read_text() for path in results.iterdir()}
+    assert (tmp_path / "plots" / "custom" / "tables.md").exists()
+    compare(tmp_path, *what, "--seeds", "2", "--extend")
+    assert [path.name for path in (tmp_path / "runs").glob("custom/cartpole/ppo/*")] == ["seed_1"]
+    for name in ("runs.csv", "curves.csv"):
+        assert (results / name).read_text().startswith(before[name])
+    found = study.read(results)
+    assert found.seeds("cartpole", "ppo") == [0, 1]
+    assert {len(curve["frames"]) for curve in found.curves_of("cartpole", "ppo").values()} == {2}
+    assert len(found.about["revisions"]) == 1 and " / " not in found.about["machine"]
+    assert found.about["command"].endswith("--seeds 2")
+    # Neither mixed with runs of other settings, nor overwritten.
+    after = {path.name: path.read_text() for path in results.iterdir()}
+    for other in (["--config", "num_envs=4"], ["--episodes", "3"]):
+        output = compare(tmp_path, *what, "--seeds", "3", *other, "--extend", expected=1)
+        assert "expected results/custom to hold cartpole ppo 0 as it is asked for now" in output
+    assert after == {path.name: path.read_text() for path in results.iterdir()}
+
+
+@pytest.mark.parametrize("preset", [name for name in compare_script.PRESETS if (RESULTS / name).exists()])
+def test_stored_results_are_what_their_preset_trains(preset):
+    stored = EarlierResults(RESULTS / preset)
+    runs = compare_script.make_runs(compare_script.Arguments(preset=preset), Path("none"))
+    missing = [str(run) for run in runs if stored.record(run) is None]
+    assert missing == stored.about["unfinished"]
+    assert len(missing) < len(runs)
 
 
 def test_what_fails_is_reported_and_stops_nothing(tmp_path):

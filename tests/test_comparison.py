@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType
 from comparison import claims, methods, tables, verdicts
 from comparison import run as run_module
 from comparison.intervals import Estimate, band, difference, estimate, iqm
+from comparison.records import EarlierResults
 from comparison.run import Run, environment, read_curve, task_setting, write_json
 from comparison.study import Study, read, write
 from tasks.anymal_push import AnymalPush
@@ -291,6 +292,17 @@ def test_the_policy_of_the_best_seed_is_kept(tmp_path):
     best = load_actor(runs[int(np.argmax(means))].folder / "stage_0", env, env.symmetry)
     assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
     assert np.isfinite(read(tmp_path / "results").goal_returns("anymal_push", "ppo", "turning")[1]).all()
+    # Also where one of the runs, the better or the other, is known from results alone.
+    for known in runs:
+        where = tmp_path / f"extended_{known.seed}"
+        write(where, [known], [], {"workers": 1})
+        lost = dataclasses.replace(known, folder=tmp_path / "lost")
+        both = [lost if run is known else run for run in runs]
+        write(where, both, [], {"workers": 1}, earlier=EarlierResults(where))
+        for name in ("runs.csv", "curves.csv"):
+            assert (where / name).read_text() == (tmp_path / "results" / name).read_text()
+        kept = load_actor(where / "policies/anymal_push/ppo", env, env.symmetry)
+        assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
 
 
 def test_a_later_stage_that_diverges_early_leaves_the_policy_of_the_one_before(tmp_path):

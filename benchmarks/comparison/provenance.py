@@ -27,7 +27,10 @@ def origin() -> dict[str, Any]:
 
 
 def joint_origin(origins: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Origins of several runs as one: commits as a list, what differs elsewhere side by side."""
+    """Origins of several runs as one: commits as a list, what differs elsewhere side by side.
+
+    An origin may have been joined before.
+    """
     names = dict.fromkeys(name for each in origins for name in each["versions"])
     return {
         "revisions": sorted({each["revision"] for each in origins}),
@@ -39,7 +42,7 @@ def joint_origin(origins: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _side_by_side(texts: Iterable[str]) -> str:
-    return " / ".join(sorted(set(texts)))
+    return " / ".join(sorted({each for text in texts for each in text.split(" / ")}))
 
 
 def command() -> str:

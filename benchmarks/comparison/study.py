@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 
 from comparison.provenance import command, joint_origin, revision
-from comparison.run import Run, last_checkpoint, read_curve, write_json
+from comparison.records import RUN, EarlierResults, Record, from_folder, policy_folder, read_table, score
+from comparison.run import Run, write_json
 from torchrl_sym.recipes import export_actor
 
-RUN = ("task", "method", "seed")
 EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")  # then the behaviour
 CURVE = (
     *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
@@ -38,6 +38,7 @@ def write(
     failed: Sequence[Run],
     about: dict[str, Any],
     points: int = POINTS,
+    earlier: EarlierResults | None = None,
 ) -> None:
     """Write the results of all finished runs.
 
@@ -47,58 +48,42 @@ def write(
         failed: runs that failed.
         about: what else goes into `study.json`.
         points: rows per curve that are kept, at most; the last one always is.
+        earlier: results with what is known of runs that are not finished in their folder.
+
+    Raises:
+        ValueError: the earlier results hold such a run with other settings.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    evaluated, curves, methods, origins, episodes = [], [], {}, [], set()
-    best: dict[tuple[str, str], list[tuple[float, Run]]] = {}
+    finished: list[Record] = []
     unfinished: list[str] = []
+    policies: dict[Path, list[tuple[float, Path]]] = {}  # scores and checkpoints of each method
+    methods: dict[str, dict[str, Any]] = {}
     for run in runs:
-        result = run.result()
-        if result is None:
+        record = from_folder(run, points) or (earlier and earlier.record(run))
+        if record is None:
             unfinished += [str(run)] * (run not in failed)
             continue
-        name = dict(zip(RUN, (run.task, run.method, run.seed), strict=True))
-        ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
-        ended["outcome"] = ended["outcome"].split(":")[0]
-        ended["revision"] = " ".join(each["revision"] for each in result["origins"])
-        rows = result["evaluation"] or [{}]
-        episodes.add(result["episodes"])
-        evaluated += [name | ended | row for row in rows]
-        if rows[0].get("success") is not None:
-            score = float(np.mean([row["return"] for row in rows if row["actions"] == "deterministic"]))
-            best.setdefault((run.task, run.method), []).append((score, run))
-        curve = read_curve(run.folder)
-        every = math.ceil(
-            run.iterations / points
-        )  # not of what there is: all seeds keep the same iterations
-        kept = [row for number, row in enumerate(curve, 1) if number % every == 0 or number == len(curve)]
-        curves += [name | row for row in kept]
-        origins += result["origins"]
-        methods.setdefault(run.task, {})[run.method] = _without_seed(result["stages"])
-    for runs_of_method in best.values():
-        _, run = max(runs_of_method, key=lambda pair: pair[0])
-        checkpoint = last_checkpoint(run.folder)
-        assert checkpoint is not None, "it was evaluated"
-        export_actor(checkpoint, policy_folder(folder, run.task) / run.method)
+        finished.append(record)
+        methods.setdefault(run.task, {})[run.method] = record.stages
+        where, reached = policy_folder(folder, run.task) / run.method, score(record.evaluated)
+        if record.checkpoint and reached is not None:
+            policies.setdefault(where, []).append((reached, record.checkpoint))
+    for where, scored in policies.items():
+        _, best = max(scored, key=lambda pair: pair[0])
+        if best != where:
+            export_actor(best, where)
+    folder.mkdir(parents=True, exist_ok=True)
+    evaluated = [row for record in finished for row in record.evaluated]
     first = (*RUN, "outcome", "revision", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
     _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
+    curves = [row for record in finished for row in record.curve]
     _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
-    collected = {"command": command(), "collected_at": revision(), "episodes": sorted(episodes)}
+    origins = [each for record in finished for each in record.origins]
+    episodes = sorted({record.episodes for record in finished})
+    collected = {"command": command(), "collected_at": revision(), "episodes": episodes}
     about = collected | joint_origin(origins) | about
     about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
     write_json(folder / "study.json", about)
-
-
-def policy_folder(folder: Path, task: str) -> Path:
-    """Where the results in a folder keep the policies of a task."""
-    return folder / "policies" / task.replace(":", ".")
-
-
-def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return [
-        stage | {"config": {k: v for k, v in stage["config"].items() if k != "seed"}} for stage in stages
-    ]
 
 
 def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
@@ -249,9 +234,9 @@ def read(folder: Path) -> Study:
         FileNotFoundError: there are no results.
     """
     about = json.loads((folder / "study.json").read_text())
-    runs = [{key: _number(value) for key, value in row.items()} for row in _rows(folder / "runs.csv")]
+    runs = [{key: _number(value) for key, value in row.items()} for row in read_table(folder / "runs.csv")]
     grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
-    for row in _rows(folder / "curves.csv"):
+    for row in read_table(folder / "curves.csv"):
         grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
     curves = {
         key: {
@@ -262,11 +247,6 @@ def read(folder: Path) -> Study:
         for key, rows in grouped.items()
     }
     return Study(about, runs, curves)
-
-
-def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def _number(text: str) -> Any:
