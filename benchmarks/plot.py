@@ -9,6 +9,7 @@ weights), `goals` (Table I seed by seed), `efficiency` (seeds that reached a ret
 Lines are interquartile means over seeds, bands their 95 % bootstrap intervals. `tables.md` has the numbers.
 """
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,8 +214,10 @@ def phases(study: Study):
     ]
     if not shown:
         return None
-    figure, axes = grid(1, len(shown), 3.4)
-    for axis, (task, method) in zip(axes[0], shown, strict=True):
+    columns = min(len(shown), 3)
+    figure, axes = grid(math.ceil(len(shown) / columns), columns, 4.2, 2.9)
+    used, unused = axes.flat[: len(shown)], axes.flat[len(shown) :]
+    for axis, (task, method) in zip(used, shown, strict=True):
         for own in study.curves_of(task, method).values():
             steps = own["frames"] / 1e6
             axis.plot(steps, own["return"], color=color(method), linewidth=0.9, alpha=0.8)
@@ -228,8 +231,11 @@ def phases(study: Study):
                 axis.axvline(middle, color="black", linewidth=0.6, linestyle=":")
                 place = (middle, 1.0)
                 axis.annotate(name, place, (2, -9), axis.get_xaxis_transform(), "offset points", fontsize=8)
-    axes[0, 0].set_ylabel("training return, per seed")
-    share_limits(axes[0])
+    for axis in axes[:, 0]:
+        axis.set_ylabel("training return, per seed")
+    for axis in unused:
+        axis.set_axis_off()
+    share_limits(used)
     return figure
 
 
