@@ -13,7 +13,6 @@ from pathlib import Path
 import tyro
 
 from comparison import claims, robot_claims
-from comparison.methods import parts
 from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
 from comparison.tables import efficiency_table, markdown, table_1
@@ -156,9 +155,9 @@ def robot_section(name: str, study: Study) -> str:
         {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
         `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
         found with augmentation and are used for all methods; none was tuned by itself.""")
-    losses = [m for m in study.methods(task) if parts(m)[0] == "ppo" and parts(m)[1]]
-    if losses:
-        close = sum(len(study.seeds(task, method)) > 1 for method in losses) > 1
+    results = robot_claims.Results(study, task, study.evaluations(task)[0])
+    if results.losses(1):
+        close = len(results.losses()) > 1
         made += "\n\n" + prose(f"""Of the weights of the mirror loss, the one whose first seed had the
             highest return with mean actions, in the mean of all evaluations, got all
             seeds{", and so did one that came close" * close}.""")

@@ -89,7 +89,7 @@ class EarlierResults:
         Raises:
             ValueError: they hold it with other settings.
         """
-        key = (run.task, run.method, str(run.seed))
+        key = (run.task, run.method, run.seed)
         if key not in self._evaluated:
             return None
         rows, asked = self._evaluated[key], run.request()
@@ -121,16 +121,15 @@ class EarlierResults:
             if (task, method) == (run.task, run.method)
         }
         best = max(scores, key=lambda seed: -math.inf if scores[seed] is None else scores[seed])
-        return folder if folder.exists() and best == str(run.seed) else None
+        return folder if folder.exists() and best == run.seed else None
 
-    def _by_run(self, name: str) -> dict[tuple[str, ...], list[dict[str, Any]]]:
-        """Rows of a table as they are written, without empty entries."""
-        grouped: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-        path = self.folder / name
-        for row in read_table(path) if path.exists() else []:
-            filled = {name: text for name, text in row.items() if text}
-            grouped.setdefault(tuple(row[name] for name in RUN), []).append(filled)
-        return grouped
+    def _by_run(self, name: str) -> dict[tuple[str, str, int], list[dict[str, str]]]:
+        """Rows of a table for every run, without empty entries."""
+        table = by_run(self.folder / name) if self.about else {}
+        return {
+            key: [{column: text for column, text in row.items() if text} for row in rows]
+            for key, rows in table.items()
+        }
 
 
 def score(evaluated: Sequence[dict[str, Any]]) -> float | None:
@@ -149,6 +148,14 @@ def read_table(path: Path) -> list[dict[str, str]]:
     """Rows of a table of the results."""
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+def by_run(path: Path) -> dict[tuple[str, str, int], list[dict[str, str]]]:
+    """Rows of a table of the results by task, method and seed."""
+    grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
+    for row in read_table(path):
+        grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
+    return grouped
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:

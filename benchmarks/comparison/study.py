@@ -19,7 +19,16 @@ from typing import Any
 import numpy as np
 
 from comparison.provenance import command, joint_origin, revision
-from comparison.records import RUN, EarlierResults, Record, from_folder, policy_folder, read_table, score
+from comparison.records import (
+    RUN,
+    EarlierResults,
+    Record,
+    by_run,
+    from_folder,
+    policy_folder,
+    read_table,
+    score,
+)
 from comparison.run import Run, write_json
 from torchrl_sym.recipes import export_actor
 
@@ -235,16 +244,13 @@ def read(folder: Path) -> Study:
     """
     about = json.loads((folder / "study.json").read_text())
     runs = [{key: _number(value) for key, value in row.items()} for row in read_table(folder / "runs.csv")]
-    grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
-    for row in read_table(folder / "curves.csv"):
-        grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
     curves = {
         key: {
             name: np.array([float(row[name] or "nan") for row in rows])
             for name in rows[0]
             if name not in RUN
         }
-        for key, rows in grouped.items()
+        for key, rows in by_run(folder / "curves.csv").items()
     }
     return Study(about, runs, curves)
 
