@@ -32,13 +32,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(BIN)/python $(PIP_INSTALL) --editable '.[dev]'
 	@touch $@
 
-# A robot's policy is replayed at the end: key frames, or where there is no OpenGL its paths from above. A
-# film (--out push.gif) takes a minute more.
+# A robot's policy is replayed first: key frames, or where there is no OpenGL its paths from above. A film
+# (--out push.gif) takes a minute more. What was seen, and what to do next, comes last.
 PUSH := anymal_push --checkpoint benchmarks/results/paper-push/policies/anymal_push/aug
 quickstart: $(INSTALLED)
-	$(BIN)/python examples/quickstart.py
-	$(BIN)/python examples/watch.py $(PUSH) --out runs/quickstart/push.png || \
+	@echo "ANYmal pushes a cube to targets all around it, with a policy that is in this repository"
+	@$(BIN)/python examples/watch.py $(PUSH) --out runs/quickstart/push.png || \
 	$(BIN)/python examples/watch.py $(PUSH) --overlay --out runs/quickstart/push_paths.png
+	@echo "CartPole: PPO against PPO with symmetric copies"
+	@$(BIN)/python examples/quickstart.py
 
 # All goals side by side from the images of one start, a minute each.
 define film

@@ -167,7 +167,7 @@ def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
             for task in experiment.tasks:
                 setting = task_setting(task)
                 for method in experiment.methods:
-                    changed = configure(task, method, setting, seed, experiment.steps, **experiment.config)
+                    changed = configure(method, setting, seed, experiment.steps, **experiment.config)
                     where = folder / task.replace(":", ".") / method / f"seed_{seed}"
                     more = (experiment.episodes, arguments.threads)
                     runs[where] = Run(task, method, seed, changed, where, *more)

@@ -12,6 +12,7 @@ import math
 
 import tasks
 from tasks.settings import SETTINGS, Setting
+from torchrl_sym.recipes import Stage
 
 make_env = functools.partial(tasks.make_env, "trifinger_repose", num_threads=1)
 
@@ -26,7 +27,7 @@ SETTING = Setting(
     then=(
         # 6.6 M steps, then 3.3 M with little noise on the whole range: after 1.6 M of them success was
         # still rising, and mean actions were behind sampled ones (79 and 88 %, augmentation, seed 0).
-        Setting(dataclasses.replace(_PLACES.config, iterations=800), _PLACES.task | _HEADING),
-        Setting(dataclasses.replace(_STEADY.config, iterations=400), _STEADY.task | _HEADING),
+        Stage(dataclasses.replace(_PLACES.config, iterations=800), _PLACES.task | _HEADING),
+        Stage(dataclasses.replace(_STEADY.config, iterations=400), _STEADY.task | _HEADING),
     ),
 )

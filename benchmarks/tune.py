@@ -4,9 +4,10 @@
 
 Every family (plain PPO, augmentation, mirror loss, naive augmentation) tries the same candidates with the
 same seeds; the best three get more seeds; the best mean return wins. The seeds are not those of the
-comparison. The winners are written down in `comparison.methods.TUNED` by hand.
+comparison. The winners are written down in `tasks.settings` (`Setting.tuned`) by hand.
 """
 
+import dataclasses
 import os
 import sys
 from dataclasses import dataclass
@@ -78,8 +79,8 @@ def main(arguments: Arguments) -> int:
 def make_run(arguments: Arguments, family: str, candidate: str, seed: int) -> Run:
     """One run of a candidate, from the task's settings whatever has been tuned already."""
     changes = CANDIDATES[candidate]
-    setting = task_setting(arguments.task)
-    setting = configure("", family, setting, seed, arguments.steps, **changes)
+    setting = dataclasses.replace(task_setting(arguments.task), tuned={})
+    setting = configure(family, setting, seed, arguments.steps, **changes)
     where = arguments.folder / arguments.task / family / candidate.replace(" ", "_") / f"seed_{seed}"
     return Run(arguments.task, f"{family}: {candidate}", seed, setting, where, arguments.episodes)
 

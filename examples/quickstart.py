@@ -2,14 +2,16 @@
 
 The pole starts flat on the right or on the left. Plain PPO often masters one side and lets the pole swing
 all the way round from the other; with symmetric copies both sides are solved alike. This script trains a
-few seeds of each in parallel processes, evaluates both starting sides, prints the table and draws the
-learning curves. Killed and started again, it continues; finished runs are not repeated.
+few seeds of each in parallel processes, each method with the settings that were tuned for it, evaluates
+both starting sides, prints the table and draws the learning curves. Killed and started again, it continues;
+finished runs are not repeated.
 """
 
 import functools
 import multiprocessing
 import os
-from concurrent.futures import ProcessPoolExecutor
+import sys
+from concurrent.futures import FIRST_EXCEPTION, ProcessPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,10 +25,18 @@ from tqdm import tqdm
 import tasks
 from tasks.evaluation import Evaluation, evaluate
 from tasks.settings import SETTINGS
-from torchrl_sym.recipes import load_actor, read_metrics, train
+from torchrl_sym.recipes import RunFolder, load_actor, read_metrics, train
+from torchrl_sym.recipes.runs import read_progress
+from torchrl_sym.recipes.workers import end_with_parent
 
-METHODS = {"PPO": "none", "PPO + augmentation": "all"}
+SETTING = SETTINGS["cartpole"]
+METHODS = {
+    "PPO": SETTING.tuned_for("ppo").replace(augmentation="none"),
+    "PPO + augmentation": SETTING.tuned_for("aug").replace(augmentation="all"),
+}
 COLORS = {"PPO": "tab:orange", "PPO + augmentation": "tab:blue"}
+# A side that is solved by swinging the long way round costs about 2 more than the other.
+DETOUR = 1.0
 
 
 @dataclass
@@ -35,8 +45,10 @@ class Arguments:
 
     seeds: int = 3
     """Seeds per method."""
-    iterations: int = 150
-    """Iterations per run, of 16384 steps each; the effect on the return shows after about 150."""
+    first_seed: int = 0
+    """The first of them."""
+    iterations: int = SETTING.config.iterations
+    """Iterations per run, of 16384 steps each."""
     episodes: int = 500
     """Evaluation episodes per starting side."""
     workers: int = os.cpu_count() or 1
@@ -46,47 +58,53 @@ class Arguments:
     picture: Path = Path("runs/quickstart/learning_curves.png")
     """Where the learning curves are drawn."""
 
+    def __post_init__(self) -> None:
+        for name in ("seeds", "iterations", "episodes", "workers"):
+            if getattr(self, name) < 1:
+                raise SystemExit(f"expected --{name} of at least 1, got {getattr(self, name)}")
 
-def run(method: str, seed: int, iterations: int, folder: Path, progress=None) -> None:
-    """One training run, in a process of its own; every finished iteration goes to the progress queue."""
+
+def run(method: str, seed: int, iterations: int, folder: Path) -> None:
+    """One training run, in a process of its own."""
     torch.set_num_threads(1)
     make_env = functools.partial(tasks.make_env, "cartpole", num_threads=1)
-    symmetry = make_env(num_envs=1, seed=0).symmetry
-    setting = SETTINGS["cartpole"].replace(
-        augmentation=METHODS[method], seed=seed, iterations=iterations, checkpoint_interval=1
-    )
-    for _ in train(setting.config, make_env, symmetry, folder=folder):
-        if progress is not None:
-            progress.put(1)
+    config = METHODS[method].replace(seed=seed, iterations=iterations).config
+    train(config, make_env, make_env(num_envs=1, seed=0).symmetry, folder=folder).run()
 
 
 def train_all(arguments: Arguments) -> dict[tuple[str, int], Path]:
     """Train every method and seed, as many at a time as there are workers, behind one progress bar."""
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     folders = {
-        (method, seed): arguments.folder / f"{METHODS[method]}-{seed}"
-        for seed in range(arguments.seeds)
-        for method in METHODS
+        (method, seed): arguments.folder / f"{config.augmentation}-{seed}"
+        for seed in seeds
+        for method, config in ((name, setting.config) for name, setting in METHODS.items())
     }
-    tables = [folder / "metrics.csv" for folder in folders.values()]
-    done = sum(len(read_metrics(table)) for table in tables if table.exists())
-    total = len(folders) * arguments.iterations
-    with multiprocessing.Manager() as manager, tqdm(total=total, initial=done, unit="it") as bar:
-        queue = manager.Queue()
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(arguments.workers, mp_context=context) as pool:
-            runs = [
-                pool.submit(run, method, seed, arguments.iterations, folder, queue)
-                for (method, seed), folder in folders.items()
-            ]
-            bar.set_description(f"{len(runs)} runs, {arguments.workers} at a time")
-            while not all(future.done() for future in runs) or not queue.empty():
-                try:
-                    bar.update(queue.get(timeout=0.5))
-                except multiprocessing.queues.Empty:  # nothing finished in the last half second
-                    continue
-            for future in runs:
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(arguments.workers, mp_context=context, initializer=end_with_parent)
+    before = done_in(folders.values())
+    bar = tqdm(total=len(folders) * arguments.iterations, initial=before, unit="it", smoothing=0.02)
+    bar.set_description(f"{len(folders)} runs, {arguments.workers} at a time")
+    try:
+        waiting = {pool.submit(run, *key, arguments.iterations, folder) for key, folder in folders.items()}
+        while waiting:
+            ended, waiting = wait(waiting, timeout=0.5, return_when=FIRST_EXCEPTION)
+            bar.update(done_in(folders.values()) - bar.n)
+            for future in ended:
                 future.result()  # raises what the run raised
+    except BaseException:
+        for process in multiprocessing.active_children():
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+        bar.close()
     return folders
+
+
+def done_in(folders) -> int:
+    """Iterations that have been done in all folders."""
+    return sum(read_progress(folder)[0] for folder in folders)
 
 
 def make_table(results: dict[tuple[str, int], Evaluation], curves: dict[tuple[str, int], list]) -> str:
@@ -150,8 +168,38 @@ def draw_curve(axes: Axes, method: str, runs: list[list[dict]], key: str) -> Non
     )
 
 
+def summary(results: dict[tuple[str, int], Evaluation]) -> str:
+    """What was seen, in words that follow from the numbers."""
+    lines = ["What you saw:"]
+    for method in METHODS:
+        found = [result for (name, _), result in results.items() if name == method]
+        detours = sum(result.variation > DETOUR for result in found)
+        worst = min(result.mean for result in found)
+        gap = max(result.variation for result in found)
+        lines.append(
+            f"  {method}: in {detours} of {len(found)} runs one side takes the long way round; the worst\n"
+            f"    run returns {worst:.2f}, and the sides of a run differ by at most {gap:.3f}."
+        )
+    return "\n".join(lines)
+
+
+def advice() -> str:
+    """What to do next, with commands for the interpreter that runs this."""
+    python = os.path.relpath(sys.executable) if Path.cwd() in Path(sys.executable).parents else "python"
+    return f"""What to do next:
+  {python} examples/train.py --help      train a robot: ANYmal pushes or climbs, three fingers repose
+  {python} examples/own_environment.py   declare and verify the symmetry of an environment
+  Your own robot: README.md, "Declare the symmetry of your robot"; the paper's claims: docs/results.md"""
+
+
 def main(arguments: Arguments) -> None:
-    folders = train_all(arguments)
+    folder = RunFolder(arguments.folder)
+    try:
+        folder.lock()  # of all runs: a second start must not take those that wait
+        folders = train_all(arguments)
+    except (BlockingIOError, ValueError) as error:
+        raise SystemExit(str(error)) from error
+
     env = tasks.make_env("cartpole", num_envs=1, num_threads=1)
     curves = {
         key: read_metrics(folder / "metrics.csv")[: arguments.iterations] for key, folder in folders.items()
@@ -167,7 +215,7 @@ def main(arguments: Arguments) -> None:
     print(f"\n{table}\n")
     print("right, left: mean return when the pole starts on that side; variation: their difference;")
     print("mirror loss: squared distance of K[pi(s)] from pi(L[s]) on states of the last iteration.")
-    print(f"\nlearning curves: {arguments.picture}")
+    print(f"\nlearning curves: {arguments.picture}\n\n{summary(results)}\n\n{advice()}")
 
 
 if __name__ == "__main__":

@@ -3,9 +3,9 @@
     python examples/train.py anymal_push --folder runs/push
     python examples/train.py anymal_climb --folder runs/low --task-kwargs height 0.2 phase C
 
-The run can be killed and started again: it continues where its last checkpoint was. Settings of several
-stages are trained in order, the last in the folder itself, those before it in `stage_0`, ...; what is
-changed on the command line is changed in all of them.
+The run can be killed and started again: it continues where its last checkpoint was. Stages are trained in
+order, in `stage_0`, `stage_1`, ... of the folder; what is changed on the command line is changed in all of
+them.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ import tyro
 import tasks
 from tasks.evaluation import evaluate
 from tasks.settings import SETTINGS
-from torchrl_sym.recipes import PPOConfig, load_actor, train
+from torchrl_sym.recipes import PPOConfig, Stage, load_actor, train_stages
 
 
 @dataclass
@@ -50,16 +50,11 @@ def main(arguments: Arguments) -> None:
     changes = {name: value for name, value in asked.items() if value != before[name]}
     kwargs = arguments.task_kwargs
     make_env = functools.partial(tasks.make_env, arguments.task, num_threads=arguments.threads)
-    stages = setting.replace(**changes).stages
-    earlier = None
-    for number, stage in enumerate(stages):
-        folder = arguments.folder if stage is stages[-1] else arguments.folder / f"stage_{number}"
-        make = functools.partial(make_env, **stage.task | kwargs)
-        symmetry = make(num_envs=1, seed=0).symmetry
-        where = {"folder": folder, "start_from": earlier, "logger": arguments.logger}
-        for _ in train(stage.config, make, symmetry, **where, progress=True):
-            pass
-        earlier = folder
+    stages = [Stage(stage.config, stage.task | kwargs) for stage in setting.replace(**changes).stages]
+    symmetry = make_env(num_envs=1, seed=0, **stages[0].task).symmetry
+    where = {"folder": arguments.folder, "logger": arguments.logger}
+    train_stages(stages, make_env, symmetry, **where, progress=True).run()
+
     for what, evaluated in setting.evaluations.items():
         env = make_env(num_envs=1, seed=0, **kwargs | evaluated)
         result = evaluate(env, load_actor(arguments.folder, env, env.symmetry), arguments.episodes)

@@ -19,7 +19,7 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import mujoco
 import torch
@@ -84,6 +84,7 @@ class Task(abc.ABC):
     Attributes:
         model: the compiled model.
         robot: the symmetry derived from it.
+        arguments: what the task was made with, by name.
         symmetry: how the group acts on observation and action.
 
     Example:
@@ -103,6 +104,14 @@ class Task(abc.ABC):
     carried: ClassVar[tuple[str, ...]] = ()
     task_terms: ClassVar[tuple[str, ...]] = ()
     max_velocity: float = 1000.0
+    arguments: dict[str, Any]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Keep the arguments, whatever a task does with them: a run says by them what it was trained on."""
+        task = super().__new__(cls)
+        names = list(inspect.signature(cls.__init__).parameters)[1:]
+        task.arguments = dict(zip(names, args, strict=False)) | kwargs
+        return task
 
     def __init__(
         self, group: PointGroup, *, episode_seconds: float | None = None, edit: Edit | None = None

@@ -266,6 +266,10 @@ class BatchedEnv(EnvBase):
         own = {"diverged": float(self.num_diverged), "physics_seconds": seconds}
         return own | self.task.metrics()
 
+    def description(self) -> dict[str, Any]:
+        """Which task this is, with its arguments: a run is not continued in another one."""
+        return {"task": self.task.name, **self.task.arguments}
+
     def save_state(self) -> dict[str, Any]:
         """Everything that decides the future of this environment, as copied tensors.
 

@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
-from torchrl_sym.recipes import PPOConfig
+from torchrl_sym.recipes import PPOConfig, Stage
 
 
 @dataclass(frozen=True)
@@ -18,21 +18,25 @@ class Setting:
     """How a task is trained.
 
     Attributes:
-        config: hyper-parameters of :func:`torchrl_sym.recipes.train`.
-        task: arguments of the task in training.
+        config: hyper-parameters of the first stage.
+        task: arguments of the task in the first stage.
         evaluations: arguments of the task in evaluation, by what is evaluated.
-        then: settings to train on with, each from the last state of the one before it.
+        then: further stages, each from the last state of the one before it.
+        tuned: changes of the hyper-parameters by family of methods, where each was tuned by itself: plain
+            PPO (``"ppo"``), augmentation (``"aug"``), mirror loss (``"loss"``), naive augmentation
+            (``"aug-naive"``).
     """
 
     config: PPOConfig
     task: dict[str, Any] = field(default_factory=dict)
     evaluations: dict[str, dict[str, Any]] = field(default_factory=lambda: {"task": {}})
-    then: tuple[Setting, ...] = ()
+    then: tuple[Stage, ...] = ()
+    tuned: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
-    def stages(self) -> tuple[Setting, ...]:
-        """This setting and those that it is continued with, in order."""
-        return (self, *(stage for setting in self.then for stage in setting.stages))
+    def stages(self) -> tuple[Stage, ...]:
+        """All stages in order, for :func:`torchrl_sym.recipes.train_stages`."""
+        return (Stage(self.config, self.task), *self.then)
 
     @property
     def frames(self) -> int:
@@ -47,11 +51,15 @@ class Setting:
             >>> SETTINGS["anymal_push"].replace(seed=1).then[0].config.seed
             1
         """
-        return dataclasses.replace(
-            self,
-            config=dataclasses.replace(self.config, **changes),
-            then=tuple(setting.replace(**changes) for setting in self.then),
+        first, *later = (
+            dataclasses.replace(stage, config=dataclasses.replace(stage.config, **changes))
+            for stage in self.stages
         )
+        return dataclasses.replace(self, config=first.config, then=tuple(later))
+
+    def tuned_for(self, family: str) -> Setting:
+        """The same with what was tuned for a family of methods, if anything was."""
+        return self.replace(**self.tuned.get(family, {}))
 
 
 # An action of 1 moves a target by 2 rad, a walking robot's by some 0.5 rad: networks put out quarters, and
@@ -79,8 +87,9 @@ _ANYMAL = PPOConfig(
     checkpoint_interval=20,
 )
 # Policies lean on their noise, which starts steps: mean actions come to a stop before the target. With less
-# of it for the last steps they lean less, and do as well in steps of 0.005 s as in those of training.
-_STEADY = {"desired_kl": 0.015, "entropy_coeff": 0.0, "initial_std": 0.08, "max_std": 0.08}
+# of it for the last steps they lean less, and do as well in steps of 0.005 s as in those of training. It is
+# the same for all methods: a learned deviation would be left wherever each of them had it.
+_STEADY = {"desired_kl": 0.015, "entropy_coeff": 0.0, "std_schedule": (0.08, 0.08)}
 # Training in steps of 0.01 s is 1.4 times as fast.
 _FAST = {"physics_timestep": 0.01}
 
@@ -110,7 +119,7 @@ _REPOSE = PPOConfig(
 )
 # Less noise for the last 1.2 M steps: mean actions, which are what is evaluated, fell behind sampled ones.
 _REPOSE_ON = dataclasses.replace(
-    _REPOSE, iterations=150, desired_kl=0.015, entropy_coeff=0.0, initial_std=0.1, max_std=0.1
+    _REPOSE, iterations=150, desired_kl=0.015, entropy_coeff=0.0, std_schedule=(0.1, 0.1)
 )
 
 # Twice the recipe's default of simulations: two thirds of the time per step, since every call of TorchRL or
@@ -125,19 +134,19 @@ _CARTPOLE = PPOConfig(
 
 SETTINGS: dict[str, Setting] = {
     "cartpole": Setting(_CARTPOLE),
-    "anymal_push": Setting(_PUSH, _FAST, then=(Setting(_PUSH_ON, _FAST),)),
+    "anymal_push": Setting(_PUSH, _FAST, then=(Stage(_PUSH_ON, _FAST),)),
     "anymal_climb": Setting(
         _CLIMB,
         _FAST,
         {"facing the box": {"phase": "B"}, "any heading": {"phase": "C"}},
         # Last in steps of 0.005 s, in which contacts at the edge differ, and on the highest box alone.
-        then=(Setting(_CLIMB_ON, {"phase": "C", "curriculum": False}),),
+        then=(Stage(_CLIMB_ON, {"phase": "C", "curriculum": False}),),
     ),
     "trifinger_repose": Setting(
         _REPOSE,
         _FAST,
         {"difficulty 1": {"difficulty": 1}},
-        then=(Setting(_REPOSE_ON, _FAST | {"curriculum": False}),),  # the whole disc, as in evaluation
+        then=(Stage(_REPOSE_ON, _FAST | {"curriculum": False}),),  # the whole disc, as in evaluation
     ),
 }
 """Settings by task name."""

@@ -46,19 +46,19 @@ def test_a_method_has_one_part_of_a_kind(name):
 
 
 def test_methods_change_the_settings():
-    config = methods.configure("cartpole", "aug-naive-raw", SETTINGS["cartpole"], seed=3).config
+    config = methods.configure("aug-naive-raw", SETTINGS["cartpole"], seed=3).config
     assert (config.augmentation, config.max_log_ratio, config.max_std) == ("naive", math.inf, math.inf)
     assert config.seed == 3
-    config = methods.configure("cartpole", "loss-10", SETTINGS["cartpole"], 0, num_envs=64).config
+    config = methods.configure("loss-10", SETTINGS["cartpole"], 0, num_envs=64).config
     assert (config.augmentation, config.mirror_coeff, config.num_envs) == ("none", 10.0, 64)
-    scaled = methods.configure("cartpole", "aug+init-4", SETTINGS["cartpole"], 0).config
+    scaled = methods.configure("aug+init-4", SETTINGS["cartpole"], 0).config
     assert (scaled.augmentation, scaled.weight_scale) == ("all", 4.0)
 
 
 def test_all_members_of_a_family_share_what_was_tuned(monkeypatch):
     monkeypatch.setitem(methods.TUNED, "cartpole", {"aug": {"gamma": 0.5}})
     gamma = {
-        name: methods.configure("cartpole", name, SETTINGS["cartpole"], 0).config.gamma
+        name: methods.configure(name, SETTINGS["cartpole"], 0).config.gamma
         for name in ("aug", "aug-random", "aug+loss-1", "ppo", "aug-naive")
     }
     default = SETTINGS["cartpole"].config.gamma
@@ -68,7 +68,7 @@ def test_all_members_of_a_family_share_what_was_tuned(monkeypatch):
 
 def test_steps_shorten_all_stages_alike():
     setting = SETTINGS["anymal_push"]
-    half = methods.configure("anymal_push", "ppo", setting, 0, steps=setting.frames // 2)
+    half = methods.configure("ppo", setting, 0, steps=setting.frames // 2)
     whole = [stage.config.iterations for stage in setting.stages]
     assert [stage.config.iterations for stage in half.stages] == [count // 2 for count in whole]
     assert half.frames == setting.frames // 2

@@ -40,17 +40,6 @@ LABELS = {
 METHOD_FIELDS = {"augmentation", "mirror_coeff", "weight_scale", "seed"}
 """Fields of the configuration that a method or a run decides."""
 
-# What `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as
-# many runs each (results/tuning); the rest is `tasks.settings`.
-TUNED: dict[str, dict[str, dict[str, Any]]] = {
-    "cartpole": {
-        "ppo": {"desired_kl": 0.005},
-        "aug": {"adapt_every": "iteration"},
-        "loss": {"desired_kl": 0.02},
-        "aug-naive": {"desired_kl": 0.02},
-    },
-}
-
 
 def parts(method: str) -> tuple[str, float, float]:
     """A method's augmentation, mirror weight and initial scale.
@@ -104,28 +93,26 @@ def label(method: str) -> str:
 
 
 def configure(
-    task: str, method: str, setting: Setting, seed: int, steps: int | None = None, **changes: Any
+    method: str, setting: Setting, seed: int, steps: int | None = None, **changes: Any
 ) -> Setting:
     """Settings of one run.
 
     Args:
-        task: its name, for what was tuned on it.
         method: a name as above.
-        setting: the task's settings.
+        setting: the task's settings, with what was tuned for families of methods.
         seed: seed of the run.
         steps: environment steps, instead of the setting's; stages shrink alike.
         **changes: further changes of the configuration.
     """
     augmentation, weight, scale = parts(method)
-    tuned = TUNED.get(task, {}).get(family(method), {})
     config = {"mirror_coeff": weight, "weight_scale": scale, "seed": seed}
-    setting = setting.replace(**tuned | AUGMENTATION[augmentation] | config | changes)
+    setting = setting.tuned_for(family(method)).replace(**AUGMENTATION[augmentation] | config | changes)
     if steps is None:
         return setting
     share = steps / setting.frames
     rounds = [max(1, math.ceil(stage.config.iterations * share - 1e-9)) for stage in setting.stages]
     first, *later = (
-        dataclasses.replace(stage, config=dataclasses.replace(stage.config, iterations=count), then=())
+        dataclasses.replace(stage, config=dataclasses.replace(stage.config, iterations=count))
         for stage, count in zip(setting.stages, rounds, strict=True)
     )
-    return dataclasses.replace(first, then=tuple(later))
+    return dataclasses.replace(setting, config=first.config, then=tuple(later))

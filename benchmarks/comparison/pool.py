@@ -8,7 +8,6 @@ and may crash: what happened is in the run's `log.txt`.
 import multiprocessing
 import os
 import sys
-import threading
 import time
 import traceback
 from collections.abc import Sequence
@@ -17,6 +16,7 @@ from tqdm import tqdm
 
 from comparison.provenance import origin
 from comparison.run import Run
+from torchrl_sym.recipes.workers import end_with_parent
 
 POLL = 0.5  # seconds between two looks at the runs' files
 
@@ -86,7 +86,7 @@ def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
 
 def _work(run: Run, code: dict) -> None:
     """The life of a worker: all it prints goes to its log."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     run.folder.mkdir(parents=True, exist_ok=True)
     with (run.folder / "log.txt").open("a") as log:
         os.dup2(log.fileno(), 1)
@@ -96,10 +96,3 @@ def _work(run: Run, code: dict) -> None:
     except Exception:
         traceback.print_exc()
         sys.exit(1)
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)  # killed: what was written so far is enough to continue

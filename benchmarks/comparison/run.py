@@ -5,7 +5,6 @@ finished, `log.txt` with everything it printed. So a run that was killed is cont
 and a finished one is recognised by its result.
 """
 
-import csv
 import dataclasses
 import fcntl
 import functools
@@ -29,7 +28,8 @@ from comparison.provenance import origin
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tasks.settings import SETTINGS, Setting
-from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train
+from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train_stages
+from torchrl_sym.recipes.runs import read_progress, stage_folders, trained_folder
 
 EVALUATION_SEED = 1000  # the same starts for every run
 MAX_STEPS = 10_000  # of an episode in evaluation
@@ -77,17 +77,7 @@ class Run:
 
     def progress(self) -> tuple[int, float]:
         """Iterations done so far, and the latest mean return (NaN at first)."""
-        done, latest = 0, float("nan")
-        for folder in stage_folders(self.folder):
-            try:
-                text = (folder / "metrics.csv").read_text()
-            except FileNotFoundError:
-                continue
-            lines = text.split("\n")[:-1]  # the last may be half written
-            if len(lines) > 1:
-                done += len(lines) - 1
-                latest = float(next(csv.DictReader([lines[0], lines[-1]]))["return"])
-        return done, latest
+        return read_progress(self.folder)
 
     @property
     def iterations(self) -> int:
@@ -132,7 +122,9 @@ class Run:
         make_env = environment(self.task, self.threads)
         outcome = "finished"
         try:
-            train_stages(self.setting, make_env, self.folder)
+            stages = self.setting.stages
+            symmetry = make_env(num_envs=1, seed=0, **stages[0].task).symmetry
+            train_stages(stages, make_env, symmetry, folder=self.folder).run()
         except FloatingPointError as error:  # a result like any other: the same seed would end here again
             outcome = f"diverged: {error}"
         curve = read_curve(self.folder)
@@ -147,7 +139,7 @@ class Run:
 
     def _evaluate(self, make_env: Callable[..., EnvBase]) -> list[dict[str, Any]]:
         """One row per evaluated task, kind of actions and goal; none if it diverged before a checkpoint."""
-        rows = []
+        rows: list[dict[str, Any]] = []
         checkpoint = last_checkpoint(self.folder)
         if checkpoint is None:
             return rows
@@ -165,28 +157,12 @@ class Run:
         return rows
 
 
-def train_stages(
-    setting: Setting, make_env: Callable[..., EnvBase], folder: Path, *, progress: bool = False
-) -> None:
-    """Train all stages of a setting in `stage_0`, `stage_1`, ... of a folder, each from the one before."""
-    earlier = None
-    for number, stage in enumerate(setting.stages):
-        make = functools.partial(make_env, **stage.task)
-        where = {"folder": folder / f"stage_{number}", "start_from": earlier, "progress": progress}
-        for _ in train(stage.config, make, make(num_envs=1, seed=0).symmetry, **where):
-            pass
-        earlier = where["folder"]
-
-
-def stage_folders(folder: Path) -> list[Path]:
-    """Folders of the stages that have begun, in order."""
-    return sorted(folder.glob("stage_*"), key=lambda path: int(path.name.removeprefix("stage_")))
-
-
 def last_checkpoint(folder: Path) -> Path | None:
-    """The last stage that has a checkpoint; one that diverged early has none of its own."""
-    kept = [stage for stage in stage_folders(folder) if (stage / "checkpoint.pt").exists()]
-    return kept[-1] if kept else None
+    """Where the policy of a run is; None if it diverged before it had learned anything."""
+    try:
+        return trained_folder(folder)
+    except FileNotFoundError:
+        return None
 
 
 def read_curve(folder: Path) -> list[dict[str, float]]:

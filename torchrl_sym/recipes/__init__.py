@@ -3,13 +3,18 @@
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_actor, make_critic
-from torchrl_sym.recipes.ppo import export_actor, load_actor, train
-from torchrl_sym.recipes.storage import RunFolder, read_metrics
+from torchrl_sym.recipes.runs import export_actor, load_actor
+from torchrl_sym.recipes.stages import Stage, train_stages
+from torchrl_sym.recipes.storage import RunFolder
+from torchrl_sym.recipes.table import read_metrics
+from torchrl_sym.recipes.training import Training, train
 
 __all__ = [
     "Episodes",
     "PPOConfig",
     "RunFolder",
+    "Stage",
+    "Training",
     "export_actor",
     "load_actor",
     "make_actor",
@@ -17,4 +22,5 @@ __all__ = [
     "read_metrics",
     "symmetry_metrics",
     "train",
+    "train_stages",
 ]

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import numbers
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+Range = tuple[Callable[[float], bool], str]
+"""Whether a number is accepted, and what to say that is."""
 
 
 @dataclass(frozen=True)
@@ -13,7 +21,7 @@ class PPOConfig:
     """What to train with; every default is a value that quadruped and cart-pole PPO is run with.
 
     Raises:
-        ValueError: a number outside its range; the message names the field.
+        ValueError: a value of another type or outside its range; the message names the field.
     """
 
     augmentation: Literal["none", "all", "random", "naive"] = "all"
@@ -73,6 +81,9 @@ class PPOConfig:
     """Lower bound of the standard deviation."""
     max_std: float = 10.0
     """Upper bound of the standard deviation: clipped actions make a large one free of cost."""
+    std_schedule: tuple[float, float] | None = None
+    """Standard deviation in the first and in the last iteration, geometric in between: it is not learned
+    then, and the initial one and its bounds have no effect. None: learned."""
     tie_std: bool = False
     """Give actions that the group exchanges (left and right knee) one standard deviation; without it, a
     policy is symmetric in its mean only."""
@@ -93,63 +104,128 @@ class PPOConfig:
     """Where networks and updates live; physics stays on the CPU."""
 
     def __post_init__(self) -> None:
-        choices = ("none", "all", "random", "naive")
-        if self.augmentation not in choices:
-            raise ValueError(f"augmentation: expected one of {choices}, got {self.augmentation!r}")
-        if self.adapt_every not in ("minibatch", "iteration"):
-            raise ValueError(f"adapt_every: expected minibatch or iteration, got {self.adapt_every!r}")
-        counts = ("iterations", "num_envs", "horizon", "epochs", "minibatches", "checkpoint_interval")
-        for name in counts:
-            value = getattr(self, name)
-            if value < 1 or int(value) != value:
-                raise ValueError(f"{name}: expected a whole number of at least 1, got {value}")
-        if not all(size >= 1 for size in self.hidden):
-            raise ValueError(f"hidden: expected positive sizes, got {self.hidden}")
-        positive = (
-            "learning_rate",
-            "max_grad_norm",
-            "initial_std",
-            "min_std",
-            "max_std",
-            "clip_epsilon",
-            "output_scale",
-            "max_log_ratio",
-        )
-        for name in positive:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        if 700 < self.max_log_ratio < math.inf:
-            raise ValueError(
-                "max_log_ratio: expected at most 700, whose exponential is a number, or inf for no bound, "
-                f"got {self.max_log_ratio}"
-            )
-        for name in ("gamma", "lmbda"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a number in [0, 1], got {getattr(self, name)}")
-        for name in ("mirror_coeff", "entropy_coeff", "critic_coeff"):
-            if not getattr(self, name) >= 0:
-                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}")
+        for field in dataclasses.fields(self):
+            value = _checked(field.name, str(field.type), getattr(self, field.name))
+            object.__setattr__(self, field.name, value)
         if self.num_envs * self.horizon % self.minibatches:
             raise ValueError(
                 f"minibatches: expected a divisor of num_envs * horizon = {self.num_envs * self.horizon}, "
                 f"got {self.minibatches}"
             )
+        for low, high in (("min_std", "max_std"), ("min_learning_rate", "max_learning_rate")):
+            if getattr(self, low) > getattr(self, high):
+                raise ValueError(
+                    f"{low}: expected at most {high} = {getattr(self, high)}, got {getattr(self, low)}"
+                )
+        if not self.min_std <= self.initial_std <= self.max_std:
+            raise ValueError(
+                f"initial_std: expected a number from min_std to max_std, [{self.min_std}, "
+                f"{self.max_std}], got {self.initial_std}"
+            )
+        if 700 < self.max_log_ratio < math.inf:
+            raise ValueError(
+                "max_log_ratio: expected at most 700, whose exponential is a number, or inf for no bound, "
+                f"got {self.max_log_ratio}"
+            )
 
-    def differences(self, other: dict) -> dict[str, tuple]:
+    def scheduled_std(self, iteration: int) -> float | None:
+        """Standard deviation of an iteration, counted from 1; None if it is learned.
+
+        Example:
+            >>> [PPOConfig(iterations=3, std_schedule=(0.4, 0.1)).scheduled_std(i) for i in (1, 2, 3)]
+            [0.4, 0.2, 0.1]
+        """
+        if self.std_schedule is None:
+            return None
+        first, last = self.std_schedule
+        done = (iteration - 1) / max(1, self.iterations - 1)
+        return first ** (1 - done) * last**done
+
+    def differences(self, stored: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
 
-        Iterations, checkpoint interval and device may change when a run is continued. A field that was
-        added after the configuration was stored counts as having had its default.
+        Iterations, checkpoint interval and device may change when a run is continued; iterations only if
+        no schedule depends on them. A field that was added after the configuration was stored counts as
+        having had its default.
         """
-        mine = dataclasses.asdict(self)
-        free = {"iterations", "checkpoint_interval", "device"}
-        other = {field.name: field.default for field in dataclasses.fields(self)} | other
+        free = {"checkpoint_interval", "device"}
+        if self.std_schedule is None or self.std_schedule[0] == self.std_schedule[1]:
+            free.add("iterations")
+        other = dataclasses.asdict(PPOConfig(**stored))
         return {
-            name: (other.get(name), value)
-            for name, value in mine.items()
-            if name not in free and _plain(other.get(name)) != _plain(value)
+            name: (other[name], value)
+            for name, value in dataclasses.asdict(self).items()
+            if name not in free and other[name] != value
         }
 
 
-def _plain(value):
-    return list(value) if isinstance(value, tuple) else value
+_CHOICES = {
+    "augmentation": ("none", "all", "random", "naive"),
+    "adapt_every": ("minibatch", "iteration"),
+}
+_POSITIVE: Range = (lambda x: 0 < x < math.inf, "a positive number")
+_NOT_NEGATIVE: Range = (lambda x: 0 <= x < math.inf, "a number >= 0")
+_SHARE: Range = (lambda x: 0 <= x <= 1, "a number in [0, 1]")
+_RANGES: dict[str, Range] = {
+    "gamma": _SHARE,
+    "lmbda": _SHARE,
+    "mirror_coeff": _NOT_NEGATIVE,
+    "critic_coeff": _NOT_NEGATIVE,
+    "entropy_coeff": _NOT_NEGATIVE,
+    "clip_epsilon": (lambda x: 0 < x < 1, "a number between 0 and 1"),
+    "max_grad_norm": (lambda x: x > 0, "a positive number, inf for no clipping"),
+    "max_std": (lambda x: x > 0, "a positive number, inf for no bound"),
+    "max_log_ratio": (lambda x: x > 0, "a positive number, inf for no bound"),
+}
+"""Which numbers a field takes, where it is not any positive one."""
+
+
+def _checked(name: str, kind: str, value: Any) -> Any:
+    """A field's value as a plain Python object, which a checkpoint can hold; NumPy's numbers are converted.
+
+    Raises:
+        ValueError: not of the field's type, or out of its range.
+    """
+    if name in _CHOICES:
+        return _expect(value in _CHOICES[name], name, f"one of {_CHOICES[name]}", value)
+    if kind == "bool":
+        return bool(_expect(isinstance(value, bool | np.bool_), name, "True or False", value))
+    if kind == "str":
+        return _device(name, value)
+    if value is None and kind.endswith("None"):
+        return None
+    if kind.startswith("tuple"):
+        _expect(isinstance(value, list | tuple), name, "a tuple of numbers", value)
+        if kind.startswith("tuple[int"):
+            return tuple(_whole(name, item, 1) for item in value)
+        _expect(len(value) == 2, name, "two numbers, the first and the last", value)
+        return tuple(_number(name, item) for item in value)
+    return _whole(name, value, 0 if name == "seed" else 1) if kind == "int" else _number(name, value)
+
+
+def _device(name: str, value: Any) -> str:
+    try:
+        return str(torch.device(value))
+    except (RuntimeError, TypeError) as error:
+        raise ValueError(
+            f"{name}: expected a device of torch, such as cpu or cuda:0, got {value!r}"
+        ) from error
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    whole = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
+    _expect(whole and least <= value < 2**63, name, f"a whole number of at least {least}", value)
+    return int(value)
+
+
+def _number(name: str, value: Any) -> float:
+    accepts, what = _RANGES.get(name, _POSITIVE)
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    _expect(real and accepts(float(value)), name, what, value)
+    return float(value)
+
+
+def _expect(condition: bool, name: str, what: str, value: Any) -> Any:
+    if not condition:
+        raise ValueError(f"{name}: expected {what}, got {value!r}")
+    return value

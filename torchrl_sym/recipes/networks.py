@@ -9,10 +9,12 @@ import torch
 from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
 
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.representations import Representation
+from torchrl_sym.symmetry import Symmetry
 
 
 class FeedForward(nn.Module):
@@ -42,12 +44,17 @@ class FeedForward(nn.Module):
 
 
 class Gaussian(nn.Module):
-    """Mean from a network and a learned, bounded standard deviation that does not depend on the state.
+    """Mean from a network, and a standard deviation that does not depend on the state.
+
+    The deviation is learned between two bounds or follows a schedule. At a bound it is held by projection
+    (:meth:`keep_in_bounds`), never by a clamp in the forward pass: the gradient of a clamp is zero beyond
+    the bound, so that a parameter which is there, as after a stage with another bound, would stay there.
 
     Args:
         mean: the network.
-        std: initial standard deviation, and its lower and upper bound.
+        std: initial standard deviation.
         size: number of actions.
+        bounds: lower and upper bound of the standard deviation.
         tied_by: the action's representation, to give equal deviations to actions that symmetric elements
             exchange (a mean of log_std over the orbit).
     """
@@ -55,23 +62,42 @@ class Gaussian(nn.Module):
     def __init__(
         self,
         mean: nn.Module,
-        std: tuple[float, float, float],
+        std: float,
         size: int,
+        bounds: tuple[float, float],
         tied_by: Representation | None = None,
     ) -> None:
         super().__init__()
-        initial, low, high = std
-        if not low <= initial <= high:
-            raise ValueError(f"expected an initial std in [{low}, {high}], got {initial}")
         self.mean = mean
-        self.log_std = nn.Parameter(torch.full((size,), math.log(initial)))
-        self.bounds = (math.log(low), math.log(high))
+        self.log_std = nn.Parameter(torch.full((size,), math.log(std)))
+        self.bounds = (math.log(bounds[0]), math.log(bounds[1]))
         self.tie = None if tied_by is None else tied_by.absolute()
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc = self.mean(*inputs)
         log_std = self.log_std if self.tie is None else self.tie.orbit(self.log_std).mean(0)
-        return loc, log_std.clamp(*self.bounds).exp().expand_as(loc)
+        return loc, log_std.exp().expand_as(loc)
+
+    @torch.no_grad()
+    def keep_in_bounds(self) -> None:
+        """Put a deviation that a step has carried beyond its bound back on it."""
+        if self.log_std.requires_grad:
+            self.log_std.clamp_(*self.bounds)
+
+    @torch.no_grad()
+    def begin(self, config: PPOConfig, iteration: int) -> None:
+        """Give the deviation the value of an iteration, counted from 1, if it follows a schedule."""
+        std = config.scheduled_std(iteration)
+        self.log_std.requires_grad_(std is None)
+        if std is None:
+            self.keep_in_bounds()  # an earlier stage may have had other bounds
+        else:
+            self.log_std.fill_(math.log(std))
+
+
+def gaussian(actor: nn.Module) -> Gaussian:
+    """The network of an actor of :func:`make_actor`."""
+    return next(module for module in actor.modules() if isinstance(module, Gaussian))
 
 
 def make_actor(
@@ -96,8 +122,8 @@ def make_actor(
             scale = config.weight_scale * (config.last_layer_scale if layer is net.linear[-1] else 1.0)
             layer.weight.mul_(scale)
             layer.bias.mul_(scale)
-    std = (config.initial_std, config.min_std, config.max_std)
-    policy = Gaussian(net, std, out_size, action if config.tie_std else None)
+    bounds = (config.min_std, config.max_std)
+    policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
         TensorDictModule(policy, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -109,3 +135,29 @@ def make_actor(
 def make_critic(config: PPOConfig, in_keys: Sequence[NestedKey], in_size: int) -> ValueOperator:
     """State value on the concatenated inputs."""
     return ValueOperator(FeedForward(in_size, 1, config.hidden), in_keys=list(in_keys))
+
+
+def make_networks(
+    config: PPOConfig, env: EnvBase, symmetry: Symmetry
+) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
+    """Actor and critic that read every observation of the environment that the symmetry declares.
+
+    Raises:
+        KeyError: the symmetry declares none of the observations.
+        TypeError: the action is not one continuous ``"action"``.
+    """
+    spec = env.full_action_spec.get("action", None)
+    if list(env.action_keys) != ["action"] or spec is None or not spec.dtype.is_floating_point:
+        raise TypeError(
+            f"expected one continuous action under 'action', got {env.full_action_spec}; write a loop with "
+            "SymmetricClipPPOLoss for other actions"
+        )
+    keys = [key for key in symmetry.keys() if key in env.observation_spec.keys(True, True)]  # noqa: SIM118
+    if not keys:
+        raise KeyError(
+            f"the environment observes {list(env.observation_spec.keys(True, True))}, none of which the "
+            f"symmetry declares ({symmetry.keys()}); add them"
+        )
+    size = sum(env.observation_spec[key].shape[-1] for key in keys)
+    actor = make_actor(config, keys, size, spec.shape[-1], symmetry["action"]).to(config.device)
+    return actor, make_critic(config, keys, size).to(config.device)

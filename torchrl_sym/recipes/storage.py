@@ -1,86 +1,153 @@
-"""What a run leaves on disk: one table of metrics and one checkpoint, both safe against a kill.
+"""What a run leaves on disk: a folder with one table of metrics, one checkpoint and a lock.
 
-A run's folder holds ``metrics.csv`` (one row per iteration) and ``checkpoint.pt`` (everything that
-decides the future of the run). The checkpoint is replaced atomically, after its row was written; when a
-run is continued, rows beyond the checkpoint are cut off. So a run that was killed at any time and
-started again leaves the same files as one that was not, but for the columns that tell the time.
+``metrics.csv`` has one row per iteration, ``checkpoint.pt`` everything that decides the future of the run.
+The checkpoint is replaced as a whole, after its row was written; when a run is continued, rows beyond the
+checkpoint are cut off. So a run that was killed at any time and started again leaves the same files as one
+that was not, but for the columns that tell the time. A folder belongs to one process at a time.
+
+There is a checkpoint before there is a row. So a table without one, like a table that lacks iterations, has
+lost something; the run is then refused, and nothing of it is touched.
 """
 
 from __future__ import annotations
 
-import csv
+import fcntl
+import io
 import os
+import pickle
+import zipfile
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import torch
 from torchrl.record.loggers import Logger, get_logger
 
-TIMING = ("seconds", "frames_per_second", "collect_seconds", "physics_seconds")
-"""Columns of ``metrics.csv`` that depend on the machine."""
+from torchrl_sym.recipes.table import MetricsTable, replace_file
+
+_KEYS = {"config", "iteration", "seconds", "parts"}  # of every checkpoint, also of an exported policy
 
 
 class RunFolder:
-    """Metrics and checkpoint of one run.
+    """Metrics and checkpoint of one run; nothing is created before something is written.
 
     Args:
-        folder: where they are; created if missing.
+        folder: where they are.
+
+    Raises:
+        NotADirectoryError: there is a file of that name.
     """
 
     def __init__(self, folder: str | os.PathLike) -> None:
         self.path = Path(folder)
-        self.path.mkdir(parents=True, exist_ok=True)
-        self.metrics = self.path / "metrics.csv"
+        if self.path.exists() and not self.path.is_dir():
+            raise NotADirectoryError(f"expected a folder, got the file {self.path}; choose another name")
+        self.table = MetricsTable(self.path / "metrics.csv")
         self.checkpoint = self.path / "checkpoint.pt"
+        self._lock: IO | None = None
+
+    def lock(self) -> None:
+        """Claim the folder for this object until :meth:`release` or the end of the process.
+
+        Raises:
+            BlockingIOError: another run holds it, in this process or in another one.
+        """
+        self.path.mkdir(parents=True, exist_ok=True)
+        lock = (self.path / "lock").open("a+")
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            lock.seek(0)
+            holder = lock.read().strip() or "unknown"
+            lock.close()
+            raise BlockingIOError(
+                f"expected a folder that nobody trains in, but process {holder} holds {self.path}; wait "
+                "for it, end it, or use another folder"
+            ) from None
+        lock.truncate(0)
+        lock.write(str(os.getpid()))
+        lock.flush()
+        self._lock = lock
+
+    def release(self) -> None:
+        """Give the folder up."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
     def save(self, checkpoint: dict[str, Any]) -> None:
-        """Replace the checkpoint; a kill leaves the old one or the new one, never half of it."""
-        partial = self.checkpoint.with_suffix(".partial")
-        torch.save(checkpoint, partial)
-        os.replace(partial, self.checkpoint)
+        """Replace the checkpoint; a kill or a full disk leaves the old one or the new one, whole.
+
+        Raises:
+            TypeError: it could not be read back, since something in it is not a plain number, text or
+                tensor. The old checkpoint is kept.
+            OSError: it could not be written; the old one is kept.
+        """
+        buffer = io.BytesIO()
+        torch.save(checkpoint, buffer)
+        _require_readable(checkpoint, buffer)
+        self.path.mkdir(parents=True, exist_ok=True)
+        self.table.sync()  # a checkpoint must not outlive its rows
+        replace_file(self.checkpoint, buffer.getvalue())
 
     def load(self) -> dict[str, Any] | None:
-        """The checkpoint, None if there is none yet."""
+        """The checkpoint, None if there is none.
+
+        Raises:
+            ValueError: it is damaged, or not one of this recipe.
+        """
         if not self.checkpoint.exists():
             return None
-        return torch.load(self.checkpoint, weights_only=True, map_location="cpu")
-
-    def append(self, row: dict[str, float]) -> None:
-        """Add one iteration to the table."""
-        new = not self.metrics.exists()
-        with self.metrics.open("a", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(row))
-            if new:
-                writer.writeheader()
-            writer.writerow(row)
-
-    def truncate(self, iterations: int) -> list[dict[str, float]]:
-        """Drop what was logged after the given number of iterations; returns the rows that stay."""
-        if not self.metrics.exists():
-            return []
-        if iterations == 0:
-            self.metrics.unlink()
-            return []
-        rows = [row for row in read_metrics(self.metrics) if row["iteration"] <= iterations]
-        partial = self.metrics.with_suffix(".partial")
-        with partial.open("w", newline="") as file:
-            writer = csv.DictWriter(file, fieldnames=list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
-        os.replace(partial, self.metrics)
-        return rows
+        remedy = "restore it from a copy, or delete the folder to train anew"
+        content = io.BytesIO(self.checkpoint.read_bytes())
+        try:
+            with zipfile.ZipFile(content) as archive:
+                if archive.testzip() is not None:  # torch does not look at the checksums
+                    raise zipfile.BadZipFile("wrong checksum")
+            content.seek(0)
+            checkpoint = torch.load(content, weights_only=True, map_location="cpu")
+        except Exception as error:
+            raise ValueError(
+                f"expected a checkpoint in {self.checkpoint}, got a file that cannot be read "
+                f"({type(error).__name__}); {remedy}"
+            ) from error
+        missing = _KEYS - set(checkpoint) if isinstance(checkpoint, dict) else _KEYS
+        if missing:
+            raise ValueError(
+                f"expected a checkpoint of recipes.train in {self.checkpoint}, got one without "
+                f"{sorted(missing)}; {remedy}"
+            )
+        return checkpoint
 
 
-def read_metrics(path: str | os.PathLike) -> list[dict[str, float]]:
-    """Rows of a ``metrics.csv``; a last row that a kill cut short is left out."""
-    with Path(path).open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    whole = [row for row in rows if None not in row and all(v not in (None, "") for v in row.values())]
-    return [{name: _number(value) for name, value in row.items()} for row in whole]
+def _require_readable(checkpoint: dict[str, Any], buffer: io.BytesIO) -> None:
+    """TypeError, which names the entries, if a checkpoint cannot be loaded with ``weights_only=True``."""
+    buffer.seek(0)
+    try:
+        torch.load(buffer, weights_only=True)
+    except pickle.UnpicklingError as error:
+        kinds = sorted(_foreign("checkpoint", checkpoint)) or ["checkpoint"]
+        raise TypeError(
+            f"expected a checkpoint of tensors, numbers and texts, which loads with weights_only=True, got "
+            f"{', '.join(kinds)}; give save_state() plain values: float(x), int(x), torch.as_tensor(x)"
+        ) from error
 
 
-def _number(text: str) -> float:
-    return int(text) if text.lstrip("-").isdigit() else float(text)
+def _foreign(name: str, value: Any) -> set[str]:
+    """Places in nested containers with a type that ``weights_only=True`` refuses."""
+    if isinstance(value, dict):
+        return {found for key, item in value.items() for found in _foreign(f"{name}[{key!r}]", item)}
+    if type(value) in (list, tuple, set):
+        return {found for item in value for found in _foreign(name, item)}
+    plain = (
+        value is None or isinstance(value, torch.Tensor) or type(value) in (bool, int, float, str, bytes)
+    )
+    return set() if plain else {f"{type(value).__module__}.{type(value).__qualname__} in {name}"}
+
+
+def require_logger(kind: str | None) -> None:
+    """ValueError unless there is such a logger."""
+    if kind not in (None, "csv", "tensorboard", "wandb"):
+        raise ValueError(f"expected logger 'csv', 'tensorboard' or 'wandb', got {kind!r}")
 
 
 def make_logger(kind: str | None, folder: str | os.PathLike | None, name: str) -> Logger | None:
@@ -91,6 +158,4 @@ def make_logger(kind: str | None, folder: str | os.PathLike | None, name: str) -
     """
     if kind in (None, "csv"):
         return None
-    if kind not in ("tensorboard", "wandb"):
-        raise ValueError(f"expected logger 'csv', 'tensorboard' or 'wandb', got {kind!r}")
     return get_logger(kind, logger_name=str(folder or "."), experiment_name=name)

@@ -1,0 +1,130 @@
+"""What a checkpoint holds, and how a run continues from it, exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import warnings
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase, TransformedEnv
+
+from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.environment import Resumable, describe, offered
+from torchrl_sym.recipes.metrics import Episodes
+from torchrl_sym.recipes.storage import RunFolder
+
+_STATE = {"episodes", "rng", "cuda_rng", "env", "transforms"}  # of a run, not of a policy alone
+
+
+def snapshot(
+    config: PPOConfig,
+    env: EnvBase,
+    parts: dict[str, Any],
+    episodes: Episodes,
+    iteration: int,
+    seconds: float,
+) -> dict[str, Any]:
+    """Everything that decides the future of the run, as plain containers of tensors and numbers."""
+    resumable = offered(env, Resumable)
+    return {
+        "config": dataclasses.asdict(config),
+        "environment": _plain(describe(env)),
+        "iteration": iteration,
+        "seconds": seconds,
+        "parts": {name: part.state_dict() for name, part in parts.items()},
+        "episodes": episodes.state_dict(),
+        "rng": torch.get_rng_state(),
+        "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
+        "env": None if resumable is None else resumable.save_state(),
+        "transforms": env.transform.state_dict() if isinstance(env, TransformedEnv) else None,
+    }
+
+
+def require_same_run(run: RunFolder, checkpoint: dict[str, Any], config: PPOConfig, env: EnvBase) -> None:
+    """A run may only be continued as what it was.
+
+    Raises:
+        ValueError: the folder holds another configuration, another environment, or no run at all.
+    """
+    if "optimizer" not in checkpoint["parts"]:
+        raise ValueError(
+            f"expected a run in {run.path}, got an exported policy, which can be loaded (load_actor) but "
+            "not trained further; use another folder"
+        )
+    missing = _STATE - checkpoint.keys()
+    if missing:
+        raise ValueError(
+            f"expected a checkpoint of recipes.train in {run.path}, got one without {sorted(missing)}; "
+            "restore it from a copy, or delete the folder to train anew"
+        )
+    stored, asked = checkpoint.get("environment"), _plain(describe(env))
+    other = {} if stored is None else _differences(stored, asked)  # earlier versions did not store it
+    if other:
+        raise ValueError(
+            f"{run.path} holds a run in another environment, {{name: (stored, requested)}} = {other}; use "
+            "another folder, or delete this one to start anew"
+        )
+    differences = config.differences(checkpoint["config"])
+    if differences:
+        raise ValueError(
+            f"{run.path} holds a run with another configuration, {{field: (stored, requested)}} = "
+            f"{differences}; use another folder, or delete this one to start anew"
+        )
+
+
+def restore(
+    run: RunFolder, checkpoint: dict[str, Any], env: EnvBase, parts: dict[str, Any], episodes: Episodes
+) -> None:
+    """Continue from a checkpoint: networks, optimizer, environment, running episodes, transforms.
+
+    Raises:
+        ValueError: the networks are of other sizes.
+    """
+    for name, part in parts.items():
+        try:
+            part.load_state_dict(checkpoint["parts"][name])
+        except (RuntimeError, ValueError, KeyError) as error:
+            reason = str(error).strip().splitlines()[-1].strip()
+            raise ValueError(
+                f"expected {run.path} to hold an {name} of the sizes that configuration and environment "
+                f"ask for, got another one ({reason}); is it a run of another task?"
+            ) from error
+    if isinstance(env, TransformedEnv):
+        env.transform.load_state_dict(checkpoint["transforms"])
+    resumable = offered(env, Resumable)
+    if resumable is not None and checkpoint["env"] is not None:
+        resumable.restore_state(checkpoint["env"])
+        episodes.load_state_dict(checkpoint["episodes"])
+    else:  # new episodes begin, whose returns are theirs alone
+        episodes.latest = checkpoint["episodes"]["latest"]
+
+
+def restore_random(checkpoint: dict[str, Any]) -> None:
+    """Continue torch's global generators."""
+    torch.set_rng_state(checkpoint["rng"])
+    if torch.cuda.is_available() and len(checkpoint["cuda_rng"]) == torch.cuda.device_count():
+        torch.cuda.set_rng_state_all(checkpoint["cuda_rng"])
+
+
+def warn_unless_exact(env: EnvBase) -> None:
+    """Say so if a run in this environment does not continue exactly."""
+    if offered(env, Resumable) is None or isinstance(env, TransformedEnv):
+        warnings.warn(
+            "the run continues with the networks and optimizer it had, but not exactly: the environment "
+            "has transforms, or no save_state() and restore_state(), so that episodes may begin anew",
+            stacklevel=4,
+        )
+
+
+def _differences(stored: dict[str, Any], asked: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    names = dict.fromkeys([*stored, *asked])
+    return {
+        name: (stored.get(name), asked.get(name)) for name in names if stored.get(name) != asked.get(name)
+    }
+
+
+def _plain(description: dict[str, Any]) -> dict[str, Any]:
+    """A description as it comes back from a file; what is neither number nor text, as text."""
+    return json.loads(json.dumps(description, default=repr))

@@ -1,0 +1,307 @@
+"""PPO with symmetry, one linear loop of TorchRL parts: collect, estimate advantages, learn.
+
+Read :meth:`_Run.iterations` from top to bottom; everything before it prepares, everything after it helps.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterator
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.collectors import Collector
+from tqdm import tqdm
+
+from torchrl_sym.recipes.checkpoint import (
+    require_same_run,
+    restore,
+    restore_random,
+    snapshot,
+    warn_unless_exact,
+)
+from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.environment import MakeEnv, Staggered, measure, offered
+from torchrl_sym.recipes.learner import Learner
+from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
+from torchrl_sym.recipes.networks import make_networks
+from torchrl_sym.recipes.storage import RunFolder, make_logger, require_logger
+from torchrl_sym.symmetry import Symmetry
+
+
+class Training(Iterator[dict[str, float]]):
+    """A training that is ready: iterate over its metrics, or :meth:`run` it to the end.
+
+    Everything has been checked when it exists; nothing is learned before it is iterated over. It can be
+    left at any time, and holds its folder until then.
+
+    Args:
+        rows: what it yields, an iteration at a time.
+        close: gives up what was prepared.
+    """
+
+    def __init__(self, rows: Generator[dict[str, float]], close: Callable[[], None]) -> None:
+        self._rows, self._close = rows, close
+        self._begun = False
+
+    def __next__(self) -> dict[str, float]:
+        self._begun = True
+        return next(self._rows)
+
+    def run(self) -> dict[str, float]:
+        """Train to the end; returns the last metrics, nothing if the training had ended before.
+
+        Example:
+            >>> import functools, tasks
+            >>> from torchrl_sym.recipes import PPOConfig, train
+            >>> make_env = functools.partial(tasks.make_env, "cartpole", num_threads=1)
+            >>> config = PPOConfig(iterations=2, num_envs=8, horizon=8)
+            >>> train(config, make_env, make_env(num_envs=1).symmetry).run()["frames"]
+            128
+        """
+        latest: dict[str, float] = {}
+        for metrics in self:
+            latest = metrics
+        return latest
+
+    def close(self) -> None:
+        """End it here, and give up its folder; what was learned since the last checkpoint is lost."""
+        self._begun = True
+        self._rows.close()
+        self._close()
+
+    def __del__(self) -> None:
+        if not self._begun:
+            self.close()
+            warnings.warn(
+                "a training was prepared but never begun; iterate over train(...), or call its run()",
+                RuntimeWarning,
+                stacklevel=2,
+            )
+
+
+def train(
+    config: PPOConfig,
+    make_env: MakeEnv,
+    symmetry: Symmetry,
+    *,
+    folder: str | os.PathLike | None = None,
+    start_from: str | os.PathLike | None = None,
+    logger: str | None = "csv",
+    progress: bool = False,
+) -> Training:
+    """Prepare a training and check all of it; iterating over it trains, and yields metrics.
+
+    With a folder, the run can be killed at any time and continues when called again, exactly: on one
+    thread the metrics are those of a run that was never interrupted. This needs an environment with
+    ``save_state()`` and ``restore_state()``, as all of ``tasks`` have, without transforms; others begin
+    new episodes when they are continued, with a warning. If the environment has ``stagger()``, it is
+    called first, so that batches hold all phases of an episode. What else it may offer:
+    :mod:`torchrl_sym.recipes.environment`.
+
+    Args:
+        config: hyper-parameters.
+        make_env: called with ``num_envs`` and ``seed``.
+        symmetry: what transforms how. Its observation keys are what actor and critic read. Also used,
+            as a metric, when nothing is augmented.
+        folder: where metrics and checkpoints go; nothing is written by default. One process at a time can
+            train in it.
+        start_from: folder of another run, whose networks, optimizer (with its learning rate), running
+            episodes and curriculum a new run begins with: to train on with other hyper-parameters, or in
+            another version of the task. Its networks and number of environments must be those of
+            ``config``.
+        logger: ``"csv"`` (metrics.csv only), or also ``"tensorboard"`` or ``"wandb"``.
+        progress: show a progress bar.
+
+    Returns:
+        A :class:`Training`, which yields one dictionary per iteration: iteration, frames, return (mean of
+        the latest finished episodes), mirror_loss, log_prob and log_prob_copies (mean log pi_k of samples
+        and of their copies), kl, every loss and diagnostic of the updates, learning_rate, std, seconds,
+        frames_per_second, collect_seconds (for this iteration's data; updates and logging take the rest of
+        its time); and what the environment's own ``metrics()`` returns, if it has any (success rate, level
+        of the curriculum). It raises FloatingPointError when an observation, a loss or a gradient is not
+        finite; the last checkpoint is still good then.
+
+    Raises:
+        BlockingIOError: another process trains in the folder.
+        ValueError: the folder holds a run with another configuration or environment, or a damaged one.
+        KeyError, ValueError: the environment and the symmetry do not fit.
+        TypeError: the action is not continuous; or an environment's state that no checkpoint can hold.
+        FileNotFoundError: there is no checkpoint to start from.
+
+    Example:
+        >>> import functools, tasks
+        >>> from torchrl_sym.recipes import PPOConfig, train
+        >>> make_env = functools.partial(tasks.make_env, "cartpole", num_threads=1)
+        >>> symmetry = make_env(num_envs=1).symmetry
+        >>> config = PPOConfig(iterations=2, num_envs=8, horizon=8)
+        >>> [metrics["frames"] for metrics in train(config, make_env, symmetry)]
+        [64, 128]
+    """
+    if not isinstance(config, PPOConfig) or not isinstance(symmetry, Symmetry) or not callable(make_env):
+        kinds = ", ".join(type(each).__name__ for each in (config, make_env, symmetry))
+        raise TypeError(
+            f"expected a PPOConfig, a function that makes environments and a Symmetry, got {kinds}"
+        )
+    storage = None if folder is None else RunFolder(folder)
+    earlier = None if start_from is None else RunFolder(start_from)
+    require_logger(logger)
+    if storage is not None:
+        storage.lock()
+    try:
+        run = _Run(config, make_env, symmetry, storage, earlier)
+    except BaseException:
+        if storage is not None:
+            storage.release()
+        raise
+    return Training(run.iterations(logger, progress), run.close)
+
+
+class _Run:
+    """Environment, learner and folder of one training, as far as they have come."""
+
+    def __init__(
+        self,
+        config: PPOConfig,
+        make_env: MakeEnv,
+        symmetry: Symmetry,
+        folder: RunFolder | None,
+        start_from: RunFolder | None,
+    ) -> None:
+        self.config, self.folder = config, folder
+        torch.manual_seed(config.seed)
+        self.env = make_env(num_envs=config.num_envs, seed=config.seed)
+        try:
+            symmetry.check_specs(self.env)
+            self.symmetry = copy.deepcopy(symmetry).to(config.device)
+            actor, critic = make_networks(config, self.env, self.symmetry)
+            self.learner = Learner(config, actor, critic, self.symmetry)
+            self.episodes = Episodes(self.env)
+            self.done, self.seconds = 0, 0.0
+            if not self._continue():
+                self._begin(start_from)
+            self.random = torch.get_rng_state()  # of the moment it begins, whatever is drawn until then
+        except BaseException:
+            self.env.close()
+            raise
+
+    def _continue(self) -> bool:
+        """Go on from the folder's checkpoint, if it has one that something has been learned for."""
+        checkpoint = None if self.folder is None else self.folder.load()
+        if self.folder is None or checkpoint is None:
+            if self.folder is not None:
+                self.folder.table.require_empty()
+            return False
+        require_same_run(self.folder, checkpoint, self.config, self.env)
+        self.folder.table.truncate(checkpoint["iteration"])
+        if checkpoint["iteration"] == 0:
+            return False
+        restore(self.folder, checkpoint, self.env, self.learner.parts, self.episodes)
+        restore_random(checkpoint)
+        self.done, self.seconds = checkpoint["iteration"], checkpoint["seconds"]
+        if self.done < self.config.iterations:
+            warn_unless_exact(self.env)
+        return True
+
+    def _begin(self, start_from: RunFolder | None) -> None:
+        """Begin, from another run or with episodes at all of their phases."""
+        if start_from is not None:
+            earlier, parts = start_from.load(), self.learner.parts
+            found = [] if earlier is None else list(earlier["parts"])
+            if earlier is None or set(parts) - set(found):
+                raise FileNotFoundError(
+                    f"expected a checkpoint with {list(parts)} in {start_from.path} to start from, found "
+                    f"{found}; train there first"
+                )
+            restore(start_from, earlier, self.env, parts, self.episodes)
+            warn_unless_exact(self.env)
+        elif (staggered := offered(self.env, Staggered)) is not None:
+            staggered.stagger()
+        if self.folder is not None:  # also to find now what could not be read back later
+            self._save()
+
+    def iterations(self, logger: str | None, progress: bool) -> Generator[dict[str, float]]:
+        """Collect and learn, yielding the metrics of every iteration."""
+        config, learner, episodes = self.config, self.learner, self.episodes
+        if self.done >= config.iterations:
+            self.close()
+            return
+        torch.set_rng_state(self.random)
+        learner.policy.begin(config, self.done + 1)
+        elsewhere = None if config.device == "cpu" else config.device
+        collector = Collector(
+            self.env,
+            learner.actor,
+            frames_per_batch=config.num_envs * config.horizon,
+            total_frames=-1,
+            policy_device=elsewhere,
+            storing_device=elsewhere,
+            auto_register_policy_transforms=False,
+        )
+        log = make_logger(logger, None if self.folder is None else self.folder.path, name="train")
+        bar = tqdm(total=config.iterations, initial=self.done, disable=not progress, unit="it")
+        began = time.perf_counter()
+        clock = began - self.seconds
+        try:
+            for data in collector:
+                self.done += 1
+                metrics = {"iteration": self.done, "frames": self.done * data.numel()}
+                metrics["collect_seconds"] = time.perf_counter() - began
+                _require_finite(data, learner.actor.in_keys)
+
+                metrics["return"] = episodes.update(data)
+                metrics |= measure(self.env)
+                metrics |= symmetry_metrics(learner.actor, self.symmetry, data)
+                metrics |= learner.learn(data)
+                metrics["std"] = float(data["scale"][..., 0, :].mean())
+
+                self.seconds = metrics["seconds"] = time.perf_counter() - clock
+                metrics["frames_per_second"] = metrics["frames"] / metrics["seconds"]
+                if self.folder is not None:
+                    self.folder.table.append(metrics)
+                    if self.done % config.checkpoint_interval == 0 or self.done >= config.iterations:
+                        self._save()
+                if log is not None:
+                    log.log_metrics(metrics, step=self.done)
+                bar.update()
+                bar.set_postfix_str(
+                    f"return {metrics['return']:.2f} mirror {metrics['mirror_loss']:.3g}", refresh=False
+                )
+                yield metrics
+
+                if self.done >= config.iterations:
+                    break
+                learner.policy.begin(config, self.done + 1)
+                collector.update_policy_weights_()
+                began = time.perf_counter()
+        finally:
+            bar.close()
+            collector.shutdown(close_env=True)
+            self.close()
+
+    def _save(self) -> None:
+        assert self.folder is not None
+        state = (self.learner.parts, self.episodes, self.done, self.seconds)
+        self.folder.save(snapshot(self.config, self.env, *state))
+
+    def close(self) -> None:
+        """Give up the folder and the environment."""
+        if self.folder is not None:
+            self.folder.release()
+        if not self.env.is_closed:
+            self.env.close()
+
+
+def _require_finite(data: TensorDictBase, keys: list) -> None:
+    """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
+    for key in [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]:
+        finite = data[key].isfinite()
+        if not bool(finite.all()):
+            bad = int((~finite.flatten(data.ndim)).any(-1).sum())
+            raise FloatingPointError(
+                f"expected finite numbers, got others in {key!r} of {bad} of {data.numel()} samples; end "
+                "episodes before the simulation diverges"
+            )
