@@ -281,7 +281,7 @@ def test_the_methods_use_what_the_search_found():
         rows = [line.split("|") for line in (stored / "README.md").read_text().splitlines() if "**" in line]
         (winner,) = [row[1].strip() for row in rows if "**" in row[column]]
         winners[methods.family(family)] = tune.CANDIDATES[winner]
-    assert methods.TUNED["cartpole"] == winners
+    assert SETTINGS["cartpole"].tuned == winners
 
 
 def test_augmentation_is_twenty_times_as_symmetric_and_no_worse():

@@ -17,7 +17,7 @@ from comparison.run import Run, environment, read_curve, task_setting, write_jso
 from comparison.study import Study, read, write
 from tasks.anymal_push import AnymalPush
 from tasks.settings import SETTINGS
-from torchrl_sym.recipes import load_actor, train
+from torchrl_sym.recipes import RunFolder, load_actor, train
 
 
 def test_a_method_is_a_sum_of_parts():
@@ -55,10 +55,10 @@ def test_methods_change_the_settings():
     assert (scaled.augmentation, scaled.weight_scale) == ("all", 4.0)
 
 
-def test_all_members_of_a_family_share_what_was_tuned(monkeypatch):
-    monkeypatch.setitem(methods.TUNED, "cartpole", {"aug": {"gamma": 0.5}})
+def test_all_members_of_a_family_share_what_was_tuned():
+    setting = dataclasses.replace(SETTINGS["cartpole"], tuned={"aug": {"gamma": 0.5}})
     gamma = {
-        name: methods.configure(name, SETTINGS["cartpole"], 0).config.gamma
+        name: methods.configure(name, setting, 0).config.gamma
         for name in ("aug", "aug-random", "aug+loss-1", "ppo", "aug-naive")
     }
     default = SETTINGS["cartpole"].config.gamma
@@ -308,11 +308,15 @@ def test_the_policy_of_the_best_seed_is_kept(tmp_path):
 def test_a_later_stage_that_diverges_early_leaves_the_policy_of_the_one_before(tmp_path):
     tiny = SETTINGS["cartpole"].replace(iterations=2, num_envs=8, horizon=4, minibatches=1)
     worse = tiny.replace(entropy_coeff=3e38)  # its gradient is not finite
-    run = Run("cartpole", "ppo", 0, dataclasses.replace(tiny, then=(worse,)), tmp_path / "run", episodes=2)
+    setting = dataclasses.replace(tiny, then=worse.stages)
+    run = Run("cartpole", "ppo", 0, setting, tmp_path / "run", episodes=2)
     run.execute()
     result = run.result()
     assert result["outcome"].startswith("diverged") and len(result["evaluation"]) == 4
-    assert not (run.folder / "stage_1" / "checkpoint.pt").exists()
+    assert RunFolder(run.folder / "stage_1").load()["iteration"] == 0
+    env = environment("cartpole")(num_envs=1)
+    whole = (load_actor(folder, env, env.symmetry) for folder in (run.folder, run.folder / "stage_0"))
+    assert all(map(torch.equal, *(actor.state_dict().values() for actor in whole)))
     write(tmp_path / "results", [run], [], {"workers": 1})
     study = read(tmp_path / "results")
     assert study.diverged("cartpole", "ppo") == {0}
@@ -321,7 +325,7 @@ def test_a_later_stage_that_diverges_early_leaves_the_policy_of_the_one_before(t
 
 def test_stages_follow_each_other_also_after_an_interruption(tmp_path):
     tiny = SETTINGS["cartpole"].replace(iterations=2, num_envs=8, horizon=4, checkpoint_interval=1)
-    setting = dataclasses.replace(tiny, then=(tiny.replace(iterations=3, gamma=0.9),))
+    setting = dataclasses.replace(tiny, then=tiny.replace(iterations=3, gamma=0.9).stages)
     whole = Run("cartpole", "ppo", 0, setting, tmp_path / "whole", episodes=2)
     whole.execute()
     curve = read_curve(whole.folder)
