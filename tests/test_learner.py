@@ -47,7 +47,7 @@ def test_the_rate_is_adapted_before_the_step_it_is_meant_for(monkeypatch):
 @pytest.mark.parametrize(("start", "bound"), [(0.5, 0.1), (0.01, 0.05)])
 def test_a_deviation_beyond_its_bound_is_put_on_it_and_learned_from_there(start, bound):
     config = dataclasses.replace(TINY, min_std=0.05, max_std=0.1, initial_std=0.1, entropy_coeff=0.0)
-    learner, data = make_learner(config)
+    learner, _ = make_learner(config)
     policy = learner.policy
     policy.log_std.data.fill_(math.log(start))
     policy.begin(config, 1)
