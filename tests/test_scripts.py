@@ -61,7 +61,7 @@ def test_train_and_continue(tmp_path):
     first = run("examples/train.py", "cartpole", "--folder", tmp_path, *TINY, *few)
     assert re.search(r"mean return -\d", first)
     run("examples/train.py", "cartpole", "--folder", tmp_path, *TINY[2:], "--config.iterations", "3", *few)
-    assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 4
+    assert len((tmp_path / "stage_0" / "metrics.csv").read_text().splitlines()) == 4
     film = tmp_path / "policy.gif"
     watch = ["--checkpoint", tmp_path, "--stochastic", "--seconds", "0.1", "--width", "64", "--out", film]
     run("examples/watch.py", "cartpole", *watch)
@@ -76,9 +76,9 @@ def test_settings_of_several_stages_are_trained_in_order(tmp_path):
     few += changed[:3]
     output = run("examples/train.py", "trifinger_repose", "--folder", tmp_path, *TINY, *few)
     assert re.search(r"difficulty 1: mean return -?\d[^\n]*\n  right .*success", output)
-    configs = [RunFolder(folder).load()["config"] for folder in (tmp_path / "stage_0", tmp_path)]
+    configs = [RunFolder(tmp_path / f"stage_{number}").load()["config"] for number in (0, 1)]
     assert [config["gamma"] for config in configs] == [0.9, 0.9]
-    assert [config["max_std"] for config in configs] == [1.0, 0.1]
+    assert [config["std_schedule"] for config in configs] == [None, (0.1, 0.1)]
     watch = ["--checkpoint", tmp_path, "--task-kwargs", "yaw", "3.0", "--seconds", "0.1", "--width", "64"]
     run("examples/watch.py", "trifinger_repose", *watch, "--out", tmp_path / "watch.gif")
     with pytest.raises(AssertionError, match="expected a yaw in"):
@@ -88,9 +88,17 @@ def test_settings_of_several_stages_are_trained_in_order(tmp_path):
 def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     picture = tmp_path / "curves.png"
     settings = ["--seeds", "1", "--iterations", "2", "--episodes", "4", "--workers", "2"]
-    output = run("examples/quickstart.py", *settings, "--folder", tmp_path, "--picture", picture)
+    settings += ["--folder", tmp_path, "--picture", picture]
+    output = run("examples/quickstart.py", *settings)
     assert "| PPO + augmentation | mean |" in output
+    assert output.index("What you saw") < output.index("What to do next")
+    assert "[torchrl]" not in output
     assert picture.stat().st_size > 10_000
+    first = RunFolder(tmp_path)
+    first.lock()
+    with pytest.raises(AssertionError, match="expected a folder that nobody trains in"):
+        run("examples/quickstart.py", *settings)
+    first.release()
 
 
 @pytest.mark.parametrize("suffix", ["png", "gif"])
