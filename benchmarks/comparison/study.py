@@ -2,8 +2,9 @@
 
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
-* `study.json`: command, commits, versions, machines; hyper-parameters per task and method; what failed;
-  what the tables hold, so that one which has lost rows is noticed.
+* `study.json`: the command that was given (until c5f032c without its `--collect` and `--extend`), commits,
+  versions, machines; hyper-parameters per task and method; what failed; what the tables hold, so that one
+  which has lost rows is noticed.
 * `policies/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
   succeed or fail; `examples/watch.py` and `behaviour.py` read it.
 """
