@@ -9,7 +9,8 @@
 * `TASK_frames`: key frames of the first two goals, a row per method and goal.
 
 Episodes are paired: every goal starts from the image of the same states. Drawn for the best seed of each
-method, with mean actions.
+method, with mean actions. A task of one's own, a module that results name, is imported if `--tasks` names
+it too.
 """
 
 import os
@@ -26,15 +27,19 @@ import numpy as np
 import torch
 import tyro
 
-from comparison.methods import label
+from compare import PRESETS
+from comparison.methods import label, parts
+from comparison.options import at_least_one, different
 from comparison.records import policy_folder
 from comparison.run import environment, task_setting
-from comparison.study import read
+from comparison.study import Study, read
 from plot import color
+from tasks import ALL_TASKS
 from tasks.anymal import LEGS
 from tasks.base import Task, create
 from tasks.environment import BatchedEnv
 from tasks.evaluation import evaluate
+from tasks.paired_physics import draw_paired_physics
 from tasks.rendering import draw_paths, record, render, save, sheet
 from tasks.state import State
 from torchrl_sym.recipes import load_actor
@@ -54,6 +59,8 @@ class Arguments:
     """What the results are called."""
     methods: tuple[str, ...] = ("ppo", "aug")
     """Whose policies."""
+    tasks: tuple[str, ...] = ()
+    """module:function that the results may name, beside the tasks and the presets: it is imported."""
     episodes: int = 6
     """Per goal, in the figures of paths."""
     touching: int = 50
@@ -88,6 +95,28 @@ class Recording:
         return Recording(self.task, states, [self.elements[row] for row in rows])
 
 
+def check(arguments: Arguments, study: Study) -> None:
+    """Refuse numbers below one, unknown methods, and results that name a module which nobody asked for.
+
+    Raises:
+        ValueError: names the option.
+    """
+    at_least_one(arguments, "episodes", "touching")
+    different("methods", arguments.methods, key=parts)
+    presets = [e.tasks for experiments in PRESETS.values() for e in experiments]
+    known = {*ALL_TASKS, *(task for each in presets for task in each), *arguments.tasks}
+    unknown = [name for name in study.tasks if name not in known]
+    if unknown:
+        raise ValueError(
+            f"expected {arguments.name} to be results of {sorted(known)}, got {unknown}, whose modules "
+            f"would be imported; if you trust them, add --tasks {' '.join(unknown)}"
+        )
+    there = {method for task in study.tasks for method in study.methods(task)}
+    missing = [method for method in arguments.methods if method not in there]
+    if missing:
+        raise ValueError(f"expected --methods of {arguments.name}, {sorted(there)}, got {missing}")
+
+
 def evaluated(name: str, seconds: float | None) -> Task:
     """A task as its first evaluation has it."""
     how = next(iter(task_setting(name).evaluations.values()))
@@ -101,6 +130,7 @@ def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
     order = task.symmetry.group.order
     elements = [g for g in range(order) for _ in range(episodes)]
     env = BatchedEnv(task, len(elements), num_threads=1, seed=0)
+    draw_paired_physics(env, SEED)
     start = task.sample_goal_states(episodes, torch.Generator().manual_seed(SEED))
     actor = load_actor(checkpoint, env, env.symmetry)
     return Recording(task, record(env, actor, start), elements)
@@ -217,15 +247,17 @@ def main(arguments: Arguments) -> None:
     results = arguments.results / arguments.name
     if not (results / "policies").is_dir():
         raise SystemExit(f"expected policies in {results}, found none; run compare.py on a robot task")
+    study = read(results)
+    check(arguments, study)
     plots = arguments.plots / arguments.name
     plots.mkdir(parents=True, exist_ok=True)
-    for name in read(results).tasks:
-        task = evaluated(name, arguments.seconds)
+    for name in study.tasks:
         folder = policy_folder(results, name)
         kept = {m: folder / m for m in arguments.methods if (folder / m).exists()}
         if not kept:
             print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
             continue
+        task = evaluated(name, arguments.seconds)
         pushing, climbing = name == "anymal_push", name == "anymal_climb"
         played = max(arguments.episodes, arguments.touching * pushing)
         recordings = {m: play(task, folder, played) for m, folder in kept.items()}

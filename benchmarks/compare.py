@@ -8,9 +8,9 @@
     python benchmarks/compare.py --tasks anymal_push --methods ppo aug-random --seeds 5
 
 Every run is a process of its own with one thread, as many at a time as there are cores. Kill it whenever
-you like: the same command goes on where it was and ends in the same results. A run that fails is reported
-and does not stop the others. Results go to benchmarks/results/NAME as tidy tables; `plot.py` draws them;
-with `--extend`, only what they lack is trained.
+you like: the same command goes on where it was and ends in the same results. A run that fails, or of which
+a file is damaged, is reported and does not stop the others. Results go to benchmarks/results/NAME as tidy
+tables; `plot.py` draws them; with `--extend`, only what they lack is trained.
 
 Your own task is `--tasks module:function`, a function that takes `num_envs` and `seed` and returns an
 environment with a `symmetry`; hyper-parameters are a `SETTING` in its module, or `--config KEY=VALUE ...`.
@@ -27,9 +27,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from comparison import provenance, study
-from comparison.methods import METHOD_FIELDS, configure
-from comparison.pool import execute_all
+from comparison import study
+from comparison.methods import METHOD_FIELDS, configure, parts
+from comparison.options import at_least_one, different
+from comparison.pool import damaged, execute_all, report
 from comparison.records import EarlierResults
 from comparison.run import Run, task_setting
 from torchrl_sym.recipes import PPOConfig
@@ -62,6 +63,7 @@ class Experiment:
     episodes: int = 500
 
 
+_OWN = Experiment(("cartpole",), ("ppo", "aug"), 5)  # what a command line changes
 _TINY = {"num_envs": 32, "horizon": 50, "epochs": 1, "minibatches": 2}
 _CARTPOLE = Experiment(("cartpole",), ALL, 10)
 _MORE_SEEDS = (
@@ -103,26 +105,27 @@ class Arguments:
 
     preset: Literal[tuple(PRESETS)] | None = None  # type: ignore[valid-type]
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
-    tasks: tuple[str, ...] = ("cartpole",)
-    """Names of tasks, or module:function."""
-    methods: tuple[str, ...] = ("ppo", "aug")
-    """ppo, aug, aug-random, aug-naive, aug-naive-raw, loss-W, init-S, and sums of them."""
-    seeds: int = 5
-    """Seeds per method, from 0: with more of them later, the first are not trained again."""
-    steps: int | None = None
+    # None: not given. A preset fixes what an option would change, also where it would change nothing.
+    tasks: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TASK ...")] = None
+    """Names of tasks, or module:function (cartpole)."""
+    methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="METHOD ...")] = None
+    """ppo, aug, aug-random, aug-naive, aug-naive-raw, loss-W, init-S, sums of them (ppo aug)."""
+    seeds: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Seeds per method, from 0 (5): with more of them later, the first are not trained again."""
+    steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Environment steps per run, instead of the task's settings."""
-    config: Annotated[tuple[str, ...], tyro.conf.arg(metavar="KEY=VALUE")] = ()
+    config: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="KEY=VALUE ...")] = None
     """Changes of PPOConfig for all runs, such as num_envs=64 'hidden=(64,64)'."""
-    episodes: int = 500
-    """Evaluation episodes per goal."""
-    workers: int = os.cpu_count() or 1
-    """Runs at a time."""
+    episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Evaluation episodes per goal (500)."""
+    workers: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Runs at a time (as many as there are cores)."""
     extend: bool = False
     """Train only what the results lack: runs that they hold already stay in them as they are."""
     collect: bool = False
     """Train nothing: write and draw what has been finished so far, and what the results hold already."""
-    threads: int = 1
-    """Threads per run."""
+    threads: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
+    """Threads per run (1)."""
     name: str | None = None
     """What the results are called; by default the preset, or else `custom`."""
     folder: Path = Path("runs/compare")
@@ -143,16 +146,17 @@ def main(arguments: Arguments) -> int:
     earlier = EarlierResults(folder) if arguments.collect or arguments.extend else None
     known = [run for run in runs if earlier and run.result() is None and earlier.record(run)]
     wanted = [run for run in runs if run not in known]
-    failed = [] if arguments.collect else execute_all(wanted, arguments.workers)
-    for run in failed:
-        print(f"FAILED: {run} (see {run.folder / 'log.txt'})")
+    about = {"workers": arguments.workers or os.cpu_count() or 1, "threads": arguments.threads or 1}
+    failed = damaged(wanted) if arguments.collect else execute_all(wanted, about["workers"])
+    report(failed)
     if not known and not any(run.result() for run in runs):
         print("no run has been finished; there is nothing to write")
         return 1
-    about = {"workers": arguments.workers, "threads": arguments.threads}
-    if earlier and len(known) == len(runs):
-        about = {key: earlier.about.get(key, value) for key, value in about.items()}
-    about["command"] = provenance.command().replace(" --collect", "").replace(" --extend", "")
+    if arguments.collect:  # how runs were made is not for this command to say
+        about = {key: earlier.about.get(key) if earlier else None for key in about}
+    if earlier and len(known) == len(runs):  # nor where nothing is new
+        kept = (*about, "command", "collected_at")
+        about |= {key: earlier.about[key] for key in kept if key in earlier.about}
     study.write(folder, runs, failed, about, earlier=earlier)
     for path in plot.draw_all(folder, arguments.plots / name):
         print(f"wrote {path}")
@@ -169,33 +173,51 @@ def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
                 for method in experiment.methods:
                     changed = configure(method, setting, seed, experiment.steps, **experiment.config)
                     where = folder / task.replace(":", ".") / method / f"seed_{seed}"
-                    more = (experiment.episodes, arguments.threads)
+                    more = (experiment.episodes, arguments.threads or 1)
                     runs[where] = Run(task, method, seed, changed, where, *more)
     return list(runs.values())
+
+
+def check(arguments: Arguments) -> None:
+    """Refuse options that contradict each other, that would be ignored, or that are out of range.
+
+    Raises:
+        ValueError: names the option.
+    """
+    at_least_one(arguments, "seeds", "steps", "episodes", "workers", "threads")
+    if arguments.name is not None and Path(arguments.name).name != arguments.name:
+        raise ValueError(f"expected a --name without a path, got {arguments.name!r}; see --output")
+    ignored = ("extend", "workers", "threads")
+    given = [f"--{name}" for name in ignored if getattr(arguments, name) not in (None, False)]
+    if arguments.collect and given:
+        raise ValueError(
+            f"expected --collect, which trains nothing, without {given}; leave out one or the other"
+        )
 
 
 def chosen(arguments: Arguments) -> Sequence[Experiment]:
     """The experiments that the command line asks for.
 
     Raises:
-        ValueError: options that contradict each other, or a number that is not positive.
+        ValueError: a preset and options that it fixes, or the same thing twice.
     """
-    for name in ("seeds", "steps", "episodes", "workers", "threads"):
-        value = getattr(arguments, name)
-        if value is not None and value < 1:
-            raise ValueError(f"expected --{name} of at least 1, got {value}")
-    if arguments.preset is None:
-        a = arguments
-        config = dict(parse(text) for text in a.config)
-        return [Experiment(a.tasks, a.methods, a.seeds, a.steps, config, a.episodes)]
-    fixed = ("tasks", "methods", "seeds", "steps", "config", "episodes")
-    given = [name for name in fixed if getattr(arguments, name) != getattr(Arguments(), name)]
-    if given:
-        raise ValueError(
-            f"expected a preset alone, got --preset {arguments.preset} and {given}, which it fixes; leave "
-            "out one or the other"
-        )
-    return PRESETS[arguments.preset]
+    check(arguments)
+    fixed = [field.name for field in dataclasses.fields(Experiment)]
+    given = {name: getattr(arguments, name) for name in fixed if getattr(arguments, name) is not None}
+    if arguments.preset is not None:
+        if given:
+            raise ValueError(
+                f"expected a preset alone, got --preset {arguments.preset} and {list(given)}, which it "
+                "fixes; leave out one or the other"
+            )
+        return PRESETS[arguments.preset]
+    if "config" in given:
+        different("config", given["config"], key=lambda text: text.partition("=")[0])
+        given["config"] = dict(parse(text) for text in given["config"])
+    experiment = dataclasses.replace(_OWN, **given)
+    different("tasks", experiment.tasks)
+    different("methods", experiment.methods, key=parts)
+    return [experiment]
 
 
 def parse(text: str) -> tuple[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import tyro
 
 from comparison import claims, robot_claims
+from comparison.files import write_whole
 from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
 from comparison.tables import efficiency_table, markdown, table_1
@@ -27,7 +28,7 @@ ROBOTS = {
 }
 """Studies of robots, their tasks and titles; those that have no results yet are left out."""
 _FALLS_ALONE = """In the oldest seeds the training returns of the first seven seconds of the second stage
-    were those of episodes that had fallen, and have been left out: there `curves.csv` has none."""
+    were those of episodes that had fallen, and are left out (`benchmarks/comparison/corrections.py`)."""
 _SAME_BEGINNING = """The first stage of every run is that of the same method and seed of paper-repose,
     copied: the settings are the same."""
 REMARKS = {
@@ -92,7 +93,7 @@ def page(study: Study, tuning: str, robots: dict[str, Study]) -> str:
         for name, caption in CAPTIONS.items()
     )
     made = prose(f"""Made by `python benchmarks/results_page.py` from
-        [benchmarks/results](../benchmarks/results); a test compares. The runs: `{about["command"]}` at
+        [benchmarks/results](../benchmarks/results); a test compares. The runs: `{command(STUDY)}` at
         {", ".join(about["revisions"])} (+: with changes on top; {versions}; {about["machine"]},
         {about["workers"]} runs at a time, threads each: {about.get("threads", 1)}; {len(study.curves)}
         runs, {hours:.1f} hours of one core in training; which run is of which commit is in `runs.csv`).
@@ -151,7 +152,7 @@ def robot_section(name: str, study: Study) -> str:
     (task, title), about = ROBOTS[name], study.about
     hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
     steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-    made = prose(f"""`{about["command"]}` at {", ".join(about["revisions"])}: {len(study.curves)} runs of
+    made = prose(f"""`{command(name)}` at {", ".join(about["revisions"])}: {len(study.curves)} runs of
         {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
         `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
         found with augmentation and are used for all methods; none was tuned by itself.""")
@@ -184,6 +185,11 @@ def robot_section(name: str, study: Study) -> str:
 {robot_figures(name)}
 {efficiency_table(study, task)}
 {throughput_table(study, task) if has_split(study, task) else ""}"""
+
+
+def command(name: str) -> str:
+    """What makes the results of a preset anew; `study.json` has what was given to make these."""
+    return f"python benchmarks/compare.py --preset {name}"
 
 
 def robot_figures(name: str) -> str:
@@ -263,12 +269,12 @@ def main(arguments: Arguments) -> None:
     study = read(arguments.results / STUDY)
     tuning = (arguments.results / "tuning" / "README.md").read_text()
     robots = {n: read(arguments.results / n) for n in ROBOTS if (arguments.results / n).exists()}
-    (arguments.docs / "results.md").write_text(page(study, tuning, robots))
+    write_whole(arguments.docs / "results.md", page(study, tuning, robots))
     blocks = {"cartpole": readme_block(study)}
     if robots:
         blocks["robots"] = readme_robot_block(robots)
     text = replace_blocks(arguments.readme.read_text(), blocks)
-    arguments.readme.write_text(text)
+    write_whole(arguments.readme, text)
 
 
 if __name__ == "__main__":

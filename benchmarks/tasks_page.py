@@ -23,6 +23,7 @@ import torch
 import tyro
 
 import tasks
+from comparison.files import write_whole
 from tasks.base import Task, create
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -242,7 +243,7 @@ def draw(task: Task, path: Path) -> None:
 
 def main(settings: Arguments) -> None:
     described = [create(name) for name in tasks.ALL_TASKS]
-    settings.out.write_text("\n\n".join([HEADER.strip(), *map(describe, described)]) + "\n")
+    write_whole(settings.out, "\n\n".join([HEADER.strip(), *map(describe, described)]) + "\n")
     for task in described if settings.pictures else ():
         draw(task, settings.out.with_name(f"tasks_{task.name}.png"))
     print(f"{len(described)} tasks: {settings.out}")

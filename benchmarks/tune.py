@@ -18,8 +18,10 @@ import numpy as np
 import tyro
 
 from comparison import study
-from comparison.methods import configure
-from comparison.pool import execute_all
+from comparison.files import write_whole
+from comparison.methods import configure, parts
+from comparison.options import at_least_one, different
+from comparison.pool import execute_all, report
 from comparison.run import Run, task_setting
 from comparison.tables import markdown
 
@@ -64,6 +66,7 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
+    check(arguments)
     names = list(CANDIDATES)[: arguments.candidates]
     runs = [make_run(arguments, f, c, seed) for seed in FIRST for f in arguments.families for c in names]
     failed = execute_all(runs, arguments.workers)
@@ -71,10 +74,25 @@ def main(arguments: Arguments) -> int:
         best = sorted(names, key=lambda c: -score(runs, f, c))[:KEPT]
         runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
     failed += execute_all([run for run in runs if run not in failed], arguments.workers)
+    report(failed)
     study.write(arguments.output, runs, failed, {"workers": arguments.workers}, points=10)
-    (arguments.output / "README.md").write_text(table(study.read(arguments.output)))
-    print((arguments.output / "README.md").read_text())
+    found = table(study.read(arguments.output))
+    write_whole(arguments.output / "README.md", found)
+    print(found)
     return 1 if failed else 0
+
+
+def check(arguments: Arguments) -> None:
+    """Refuse options out of range, and families that are the same.
+
+    Raises:
+        ValueError: names the option.
+    """
+    at_least_one(arguments, "steps", "candidates", "episodes", "workers")
+    if arguments.candidates > len(CANDIDATES):
+        most = f"at most {len(CANDIDATES)}, which there are"
+        raise ValueError(f"expected --candidates of {most}, got {arguments.candidates}")
+    different("families", arguments.families, key=parts)
 
 
 def make_run(arguments: Arguments, family: str, candidate: str, seed: int) -> Run:

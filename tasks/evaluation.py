@@ -4,12 +4,13 @@ The group maps the canonical goal onto every equivalent one, so an optimal polic
 all of them. The starts are paired: episode k of goal g is episode k of the canonical goal, mapped
 by g. Then an exactly equivariant policy has exactly equal returns, and what `variation` shows is
 the policy's asymmetry alone, not the luck of the draw. `variation` is the measure of the paper's
-Table I.
+Table I. Physics that a task randomises is paired in the same way: see `tasks.paired_physics`.
 """
 
 from __future__ import annotations
 
 import contextlib
+import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
@@ -20,6 +21,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from tasks.base import create
 from tasks.environment import BatchedEnv
+from tasks.paired_physics import draw_paired_physics
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,7 @@ def evaluate(
     """Run one episode per goal and start state, all at once.
 
     Success is judged at the last state of an episode; one whose simulation diverged has failed.
+    A task that randomises its physics is evaluated with draws of it, the same for all goals of a start.
 
     Args:
         env: an environment, whose task is evaluated in simulations of its own (the environment
@@ -113,7 +116,8 @@ def evaluate(
         policy: writes ``"action"`` from ``"observation"``, for any batch size. Runs without
             gradients, in the mode (train, eval) it is in.
         episodes: episodes per goal.
-        seed: seed of the start states and of sampled actions; torch's global generators are put back.
+        seed: seed of the start states, of randomised physics and of sampled actions; torch's global
+            generators are put back.
         num_threads: physics threads.
         exploration: ``ExplorationType.RANDOM`` evaluates sampled actions. Starts are paired then too,
             the noise of the actions is not.
@@ -122,7 +126,9 @@ def evaluate(
         Returns, successes and terms, per goal.
 
     Raises:
-        TypeError: ``env`` is neither a :class:`BatchedEnv` nor a name.
+        TypeError: ``env`` is neither a :class:`BatchedEnv` nor a name, or an argument of a wrong type.
+        ValueError: less than one episode, a negative number, or randomised physics that cannot be paired
+            (:func:`~tasks.paired_physics.draw_paired_physics`).
 
     Example:
         >>> import torch
@@ -141,11 +147,20 @@ def evaluate(
             f"expected a BatchedEnv or a task name, got {type(env).__name__}; pass the base "
             "environment of a transformed one, and a policy that reads its plain observation"
         )
+    if not callable(policy) or not isinstance(exploration, ExplorationType):
+        raise TypeError(
+            "expected a policy to call with a tensordict and an ExplorationType, got "
+            f"{type(policy).__name__} and {exploration!r}"
+        )
+    episodes, seed = _whole("episodes", episodes, 1), _whole("seed", seed, 0)
+    num_threads = _whole("num_threads", num_threads, 0)
     order = task.symmetry.group.order
     generator = torch.Generator().manual_seed(seed)
     starts = task.sample_goal_states(episodes, generator)
     batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, device=device)
-    noise_seed = int(torch.randint(2**31, (), generator=generator))  # not the stream of the starts
+    # Streams of their own, so that neither moves the starts.
+    noise_seed, physics_seed = torch.randint(2**31, (2,), generator=generator).tolist()
+    draw_paired_physics(batched, physics_seed)
     with torch.no_grad(), set_exploration_type(exploration), _seeded(noise_seed):
         returns, successes, terms, behaviour = _run(batched, policy, batched.reset_to(starts))
     shape = (order, episodes)
@@ -161,6 +176,16 @@ def evaluate(
         task.task_terms,
         by_goal(behaviour),
     )
+
+
+def _whole(name: str, value: int, least: int) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError as error:
+        raise TypeError(f"expected {name} to be a whole number, got {value!r}") from error
+    if isinstance(value, bool) or number < least:
+        raise ValueError(f"expected {name} of at least {least}, got {value!r}")
+    return number
 
 
 @contextlib.contextmanager

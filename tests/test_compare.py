@@ -21,6 +21,7 @@ import compare as compare_script
 import tasks
 import tune
 from comparison import claims, methods, study
+from comparison.files import write_json
 from comparison.records import EarlierResults
 from comparison.run import Run
 from tasks.settings import SETTINGS
@@ -121,8 +122,10 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     compare(killed, *what)
     for name in ("runs.csv", "curves.csv"):
         assert rows(whole / "results/custom" / name) == rows(killed / "results/custom" / name)
-    about = [(folder / "results/custom/study.json").read_text() for folder in (whole, killed)]
+    about = [json.loads((folder / "results/custom/study.json").read_text()) for folder in (whole, killed)]
+    tables = [each.pop("tables") for each in about]  # their content has times
     assert about[0] == about[1]
+    assert [each["curves.csv"]["rows"] for each in tables] == [24, 24]
     # What is finished can be looked at while the rest is not, without training anything.
     changes = {"seeds": 1, "steps": 8 * 25 * 12, "config": tuple(TINY[1:]), "episodes": 2, "collect": True}
     places = {"folder": whole / "runs", "output": tmp_path / "results", "plots": tmp_path / "plots"}
@@ -151,7 +154,7 @@ def test_results_are_extended_where_the_runs_are_gone(tmp_path):
     assert found.seeds("cartpole", "ppo") == [0, 1]
     assert {len(curve["frames"]) for curve in found.curves_of("cartpole", "ppo").values()} == {2}
     assert len(found.about["revisions"]) == 1 and " / " not in found.about["machine"]
-    assert found.about["command"].endswith("--seeds 2")
+    assert found.about["command"].endswith("--seeds 2 --extend"), "what was given"
     # Neither mixed with runs of other settings, nor overwritten.
     after = {path.name: path.read_text() for path in results.iterdir()}
     for other in (["--config", "num_envs=4"], ["--episodes", "3"]):
@@ -208,11 +211,30 @@ def test_other_environments_and_runs_that_diverge(tmp_path):
         (["--workers", "0"], "expected --workers of at least 1"),
         (["--steps", "-5"], "expected --steps of at least 1"),
         (["--preset", "smoke", "--seeds", "3"], "expected a preset alone"),
+        (["--preset", "smoke", "--tasks", "mine:make"], r"got --preset smoke and \['tasks'\]"),
+        (["--collect", "--extend"], "expected --collect, which trains nothing, without .'--extend'."),
+        (["--collect", "--workers", "2"], "expected --collect, .* without .'--workers'."),
+        (["--collect", "--threads", "1"], "expected --collect, .* without .'--threads'."),
+        (["--tasks", "cartpool"], "expected a task of"),
+        (["--tasks", "cartpole", "cartpole"], "expected different --tasks"),
+        (["--tasks"], "expected one or more values of --tasks"),
+        (["--methods", "aug", "ppo", "aug"], "expected different --methods"),
+        (["--methods", "aug+loss-1", "loss-1.0+aug"], "expected different --methods"),
+        (["--config", "num_envs=4", "num_envs=8"], "expected different --config"),
+        (["--name", "a/b"], "expected a --name without a path"),
     ],
 )
 def test_bad_input_is_refused_before_anything_starts(tmp_path, arguments, complaint):
     with pytest.raises(ValueError, match=complaint):
         compare_script.make_runs(tyro.cli(compare_script.Arguments, args=arguments), tmp_path)
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(compare_script.Experiment)])
+def test_an_option_beside_a_preset_is_refused_also_with_the_value_it_has_anyway(tmp_path, name):
+    value = getattr(compare_script.chosen(compare_script.Arguments())[0], name)
+    given = compare_script.Arguments(preset="smoke", **{name: () if name == "config" else value or 1})
+    with pytest.raises(ValueError, match=rf"got --preset smoke and \['{name}'\]"):
+        compare_script.make_runs(given, tmp_path)
 
 
 def test_presets():
@@ -257,14 +279,35 @@ def test_tuning_gives_every_family_the_same(tmp_path):
     assert "".join(lines).count("**") == 4  # one winner per family
 
 
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"workers": 0}, "expected --workers of at least 1"),
+        ({"steps": 0}, "expected --steps of at least 1"),
+        ({"episodes": -1}, "expected --episodes of at least 1"),
+        ({"candidates": 0}, "expected --candidates of at least 1"),
+        ({"candidates": 99}, "expected --candidates of at most 6"),
+        ({"families": ()}, "expected one or more values of --families"),
+        ({"families": ("ppo", "ppo")}, "expected different --families"),
+        ({"families": ("pop",)}, "expected a method made of"),
+    ],
+)
+def test_a_search_that_cannot_be_made_is_refused(tmp_path, changes, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        tune.main(tune.Arguments(folder=tmp_path, output=tmp_path / "results", **changes))
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_search_prefers_high_returns_and_complete_candidates(tmp_path):
     def run(candidate, seed, value):
         folder = tmp_path / candidate / str(seed)
         made = Run("cartpole", f"ppo: {candidate}", seed, SETTINGS["cartpole"], folder)
         folder.mkdir(parents=True)
         if value is not None:
-            rows = [{"actions": "deterministic", "return": value}, {"actions": "sampled", "return": 9.0}]
-            (folder / "result.json").write_text(json.dumps(made.request() | {"evaluation": rows}))
+            row = {"what": "task", "goal": "right", "actions": "deterministic", "return": value}
+            rows = [row, row | {"actions": "sampled", "return": 9.0}]
+            ended = {"outcome": "finished", "iterations": 1, "frames": 1, "seconds": 1.0, "origins": []}
+            write_json(folder / "result.json", made.request() | ended | {"evaluation": rows})
         return made
 
     runs = [run("good", 0, -1.0), run("good", 1, -2.0), run("lucky", 0, -0.5), run("lucky", 1, None)]

@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -11,9 +13,10 @@ from torchrl.envs.utils import ExplorationType
 
 from comparison import claims, methods, tables, verdicts
 from comparison import run as run_module
+from comparison.files import write_json
 from comparison.intervals import Estimate, band, difference, estimate, iqm
 from comparison.records import EarlierResults
-from comparison.run import Run, environment, read_curve, task_setting, write_json
+from comparison.run import Run, environment, read_curve, task_setting
 from comparison.study import Study, read, write
 from tasks.anymal_push import AnymalPush
 from tasks.settings import SETTINGS
@@ -257,7 +260,7 @@ def test_results_survive_writing_and_reading(tmp_path):
     # What was trained elsewhere says so, wherever it is collected.
     stored = run.result()
     other = dataclasses.replace(run, seed=7, setting=setting.replace(seed=7), folder=tmp_path / "other")
-    other.folder.mkdir()
+    shutil.copytree(run.folder, other.folder)
     (here,) = stored["origins"]
     elsewhere = {"machine": "elsewhere", "versions": here["versions"] | {"torch": "0"}, "revision": "r"}
     write_json(other.folder / "result.json", stored | other.request() | {"origins": [elsewhere]})
@@ -369,7 +372,18 @@ def test_episodes_that_never_end_are_refused(monkeypatch):
 
 
 def test_an_unknown_task_says_what_is_expected():
-    for task in ("cartpool", "no_such_module:make", "math:no_such_function"):
+    for task in ("cartpool", "no_such_module:make", "math:no_such_function", "math:pi", ".x:make", "math"):
         with pytest.raises(ValueError, match="expected a task of"):
             environment(task)
     assert task_setting("cartpole") is SETTINGS["cartpole"]
+
+
+def test_a_module_where_the_command_was_given_takes_the_place_of_no_other(tmp_path, monkeypatch):
+    (tmp_path / "wave.py").write_text("raise RuntimeError('imported from the working directory')")
+    (tmp_path / "somebodys.py").write_text("SETTING = 3\nmake = dict")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [path for path in sys.path if path])
+    monkeypatch.delitem(sys.modules, "wave", raising=False)
+    environment("wave:open")
+    with pytest.raises(ValueError, match=r"expected SETTING of somebodys .* got int"):
+        task_setting("somebodys:make")

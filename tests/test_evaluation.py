@@ -6,7 +6,8 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from tasks.base import Task
+from tasks.base import Task, create, uniform
+from tasks.cartpole import CartPole
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tests.task_helpers import Falling, all_tasks, make
@@ -214,3 +215,102 @@ def test_behaviour_adds_up_over_the_episode_goal_by_goal():
     assert set(result.goal_behaviours) == {"right", "left"}
     assert result.goal_behaviours["left"]["path"] == pytest.approx(float(result.behaviour["path"][1]))
     assert result.goal_behaviours["left"]["path"] > 0
+
+
+class Heavier(CartPole):
+    """The pole's mass is drawn for every episode."""
+
+    def randomize(self, simulation, ids, generator):
+        simulation.expand("body_mass")[ids, 2] = uniform((0.1, 0.3), len(ids), generator)
+        simulation.refresh(ids)
+
+
+def still(env):
+    return TensorDictModule(
+        lambda x: torch.zeros(len(x), env.task.action_size), ["observation"], ["action"]
+    )  # fmt: skip
+
+
+def test_randomised_physics_is_drawn_and_is_the_same_for_all_goals():
+    env = BatchedEnv(Heavier(), 1, num_threads=1)
+    policy = TensorDictModule(lambda x: -0.5 * x[..., 2:], ["observation"], ["action"])
+    drawn, nominal = (evaluate(each, policy, 20, num_threads=1).returns for each in (env, "cartpole"))
+    assert torch.equal(drawn[0], drawn[1])
+    assert (drawn[0] != nominal[0]).all()
+    assert torch.equal(drawn, evaluate(env, policy, 20, num_threads=2).returns)
+    assert env.simulation.save().keys() == {"rows"}, "the environment itself is not touched"
+
+
+@pytest.mark.parametrize(
+    ("name", "ranges"),
+    [
+        ("anymal_push", {"friction": (0.5, 1.2), "added_mass": (-2.0, 4.0)}),
+        ("anymal_climb", {"friction": (0.5, 1.2), "added_mass": (-2.0, 4.0)}),
+        ("trifinger_repose", {"friction": (0.5, 1.5), "cube_mass": (0.06, 0.1)}),
+    ],
+)
+def test_ranges_of_the_tasks_are_evaluated(name, ranges):
+    plain, random = (make(name, num_envs=1, episode_seconds=0.5, **kwargs) for kwargs in ({}, ranges))
+    found = evaluate(random, still(random), 3, num_threads=1).returns
+    assert found.std(dim=1).min() > 0
+    torch.testing.assert_close(found, found[:1].expand_as(found), rtol=1e-4, atol=1e-4)
+    assert not torch.equal(found, evaluate(plain, still(plain), 3, num_threads=1).returns)
+
+
+def test_draws_of_a_model_that_is_not_symmetric_itself_are_paired():
+    task = create("anymal_push", weak_leg="LF", friction=(0.5, 1.2), episode_seconds=0.1)
+    env = BatchedEnv(task, 1, num_threads=1)
+    assert torch.isfinite(evaluate(env, still(env), 2, num_threads=1).returns).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "part", "complaint"),
+    [
+        ("geom_friction", "LF_knee", "got friction that 'reflect-x' changes"),
+        ("body_mass", "LF_thigh", "got mass that 'reflect-x' changes"),
+        ("dof_damping", "LF_HFE", "got damping that 'reflect-x' changes"),
+        ("actuator_gainprm", "LF_HFE", "got actuator gain that 'reflect-x' changes"),
+        ("qpos_spring", None, "to draw some of .* got .'qpos_spring'"),
+    ],
+)
+def test_draws_that_have_other_images_are_refused(field, part, complaint):
+    task = create("anymal_push", episode_seconds=0.1)
+    kind = {"dof": "joint"}.get(field.split("_")[0], field.split("_")[0])
+    number = getattr(task.model, kind)(part).id if part else 0
+    number = int(task.model.jnt_dofadr[number]) if kind == "joint" else number
+
+    def randomize(simulation, ids, generator):
+        for row, factor in zip(ids, uniform((1.1, 1.2), len(ids), generator), strict=True):
+            own = simulation.expand(field)[row, number]
+            simulation.expand(field)[row, number] = own * factor + 0.1
+
+    task.randomize = randomize
+    env = BatchedEnv(task, 1, num_threads=1)
+    with pytest.raises(ValueError, match=complaint):
+        evaluate(env, still(env), 3, num_threads=1)
+
+
+def test_draws_that_no_seed_repeats_are_refused():
+    task = Heavier()
+    task.randomize = lambda simulation, ids, generator: Heavier.randomize(task, simulation, ids, None)
+    env = BatchedEnv(task, 1, num_threads=1)
+    with pytest.raises(ValueError, match="to draw from its generator alone, got different body_mass"):
+        evaluate(env, still(env), 3, num_threads=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "complaint"),
+    [
+        ({"episodes": 0}, ValueError, "expected episodes of at least 1, got 0"),
+        ({"episodes": True}, ValueError, "expected episodes of at least 1, got True"),
+        ({"episodes": 2.0}, TypeError, "expected episodes to be a whole number, got 2.0"),
+        ({"seed": -1}, ValueError, "expected seed of at least 0"),
+        ({"seed": None}, TypeError, "expected seed to be a whole number"),
+        ({"num_threads": -1}, ValueError, "expected num_threads of at least 0"),
+        ({"exploration": "random"}, TypeError, "expected a policy .* and an ExplorationType, .* 'random'"),
+        ({"policy": None}, TypeError, "expected a policy to call with a tensordict"),
+    ],
+)
+def test_arguments_of_evaluate_are_checked(arguments, error, complaint):
+    with pytest.raises(error, match=complaint):
+        evaluate("cartpole", **{"policy": noisy(), "episodes": 2} | arguments)

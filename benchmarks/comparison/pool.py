@@ -21,14 +21,33 @@ from torchrl_sym.recipes.workers import end_with_parent
 POLL = 0.5  # seconds between two looks at the runs' files
 
 
+def damaged(runs: Sequence[Run]) -> list[Run]:
+    """Runs of which a file is damaged: it is left as it is, and they can neither be used nor continued."""
+    return [run for run in runs if run.damage()]
+
+
+def report(failed: Sequence[Run]) -> None:
+    """Say which runs failed, and where to look, or what to do about a damaged file."""
+    for run in failed:
+        log = run.folder / "log.txt"
+        print(f"FAILED: {run} ({run.damage() or f'see {log}'})")
+
+
 def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
-    """Execute what is not finished, at most `workers` at a time; returns the runs that failed."""
+    """Execute what is not finished, at most `workers` at a time; returns the runs that failed.
+
+    Raises:
+        ValueError: less than one worker.
+    """
+    if workers < 1:
+        raise ValueError(f"expected at least one worker, got {workers}")
+    failed = damaged(runs)
+    runs = [run for run in runs if run not in failed]
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torchrl_sym.recipes", "tasks.evaluation", "tyro", "tqdm"])
     code = origin()  # that which the server loads now, whatever is committed while runs wait
     waiting = [run for run in runs if run.result() is None]
     active: dict[int, tuple[Run, multiprocessing.Process, tqdm]] = {}  # by line on the screen
-    failed: list[Run] = []
     total = sum(run.iterations for run in runs)
     before = total - sum(run.iterations - run.progress()[0] for run in waiting)
     bar = tqdm(total=total, initial=before, unit="it", smoothing=0.02, disable=None)

@@ -2,6 +2,7 @@
 
 import os
 import platform
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
@@ -46,8 +47,8 @@ def _side_by_side(texts: Iterable[str]) -> str:
 
 
 def command() -> str:
-    """The command line, without paths of this machine."""
-    return " ".join(["python", *(_relative(argument) for argument in sys.argv)])
+    """The command line as it was given, to be given again; paths as seen from where it was given."""
+    return shlex.join(["python", *(_relative(argument) for argument in sys.argv)])
 
 
 def revision() -> str:
@@ -64,6 +65,6 @@ def _git(*arguments: str) -> str:
 
 
 def _relative(argument: str) -> str:
-    """An argument without the path of this machine."""
-    path = Path(argument)
-    return os.path.relpath(path) if path.is_absolute() else argument
+    """An argument, `--option=VALUE` too, without the path of this machine."""
+    option, equals, value = argument.rpartition("=")
+    return f"{option}{equals}{os.path.relpath(value) if Path(value).is_absolute() else value}"

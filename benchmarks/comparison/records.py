@@ -5,8 +5,9 @@ comparison can be extended anywhere, the runs that its results hold need no fold
 the very settings that are asked for.
 """
 
+import contextlib
 import csv
-import json
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,9 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from comparison.run import Run, last_checkpoint, read_curve
+from comparison.files import Damaged, Kind, finish, read_json, read_table
+from comparison.run import Run, last_checkpoint
 
 RUN = ("task", "method", "seed")
+TABLES = ("runs.csv", "curves.csv")
+ABOUT: dict[str, Kind] = {"methods": dict, "command": str, "versions": dict, "machine": str}
+RESTORE = "restore it, such as by `git checkout`, or delete the folder and --collect again"
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,9 @@ def from_folder(run: Run, points: int) -> Record | None:
     Args:
         run: the run.
         points: rows of its curve that are kept, at most; the last one always is.
+
+    Raises:
+        Damaged: its metrics are not those that led to its result.
     """
     result = run.result()
     if result is None:
@@ -55,7 +63,7 @@ def from_folder(run: Run, points: int) -> Record | None:
     ended = {key: result[key] for key in ("outcome", "frames", "seconds")}
     ended["outcome"] = ended["outcome"].split(":")[0]
     ended["revision"] = " ".join(each["revision"] for each in result["origins"])
-    curve = read_curve(run.folder)
+    curve = run.curve(result)
     every = math.ceil(run.iterations / points)  # not of what there is: all seeds keep the same iterations
     return Record(
         evaluated=[name | ended | row for row in result["evaluation"] or [{}]],
@@ -74,12 +82,14 @@ class EarlierResults:
 
     Args:
         folder: where `study.write` has written; there may be nothing yet.
+
+    Raises:
+        Damaged: a file of the results is not as it was written.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        about = folder / "study.json"
-        self.about: dict[str, Any] = json.loads(about.read_text()) if about.exists() else {}
+        self.about = read_about(folder)
         self._evaluated = self._by_run("runs.csv")
         self._curves = self._by_run("curves.csv")
 
@@ -125,7 +135,7 @@ class EarlierResults:
 
     def _by_run(self, name: str) -> dict[tuple[str, str, int], list[dict[str, str]]]:
         """Rows of a table for every run, without empty entries."""
-        table = by_run(self.folder / name) if self.about else {}
+        table = by_run(rows_of(self.folder, name, self.about)) if self.about else {}
         return {
             key: [{column: text for column, text in row.items() if text} for row in rows]
             for key, rows in table.items()
@@ -144,16 +154,50 @@ def policy_folder(folder: Path, task: str) -> Path:
     return folder / "policies" / task.replace(":", ".")
 
 
-def read_table(path: Path) -> list[dict[str, str]]:
-    """Rows of a table of the results."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+def read_about(folder: Path) -> dict[str, Any]:
+    """The description of results, `study.json`; empty if there is none.
+
+    Raises:
+        Damaged: it is not as it was written.
+    """
+    path = folder / "study.json"
+    about = read_json(path, ABOUT, RESTORE)
+    tables = about.get("tables")
+    if about and not isinstance(tables, dict):
+        raise Damaged(
+            f"expected {path} to say what its tables hold (`tables`), got nothing; if they are whole, run "
+            f"python benchmarks/seal.py {folder.name}"
+        )
+    return about
 
 
-def by_run(path: Path) -> dict[tuple[str, str, int], list[dict[str, str]]]:
+def rows_of(folder: Path, name: str, about: dict[str, Any]) -> list[dict[str, str]]:
+    """Rows of a table of the results, which must be as it was written.
+
+    Raises:
+        Damaged: it is another one, or `study.json` knows none of that name.
+    """
+    expected = about["tables"].get(name)
+    if not isinstance(expected, dict) or {"rows", "sha256"} - expected.keys():
+        raise Damaged(f"expected {folder / 'study.json'} to describe {name}, got {expected!r}; {RESTORE}")
+    return list(csv.DictReader(io.StringIO(read_table(folder / name, expected, RESTORE))))
+
+
+def finish_writing(folder: Path) -> None:
+    """Put tables that a description of results names by content in their places.
+
+    What describes nothing, or is damaged, is for the next content to replace.
+    """
+    with contextlib.suppress(Damaged):
+        tables = read_about(folder).get("tables", {})
+        for name in TABLES:
+            finish(folder / name, tables.get(name))
+
+
+def by_run(rows: Sequence[dict[str, str]]) -> dict[tuple[str, str, int], list[dict[str, str]]]:
     """Rows of a table of the results by task, method and seed."""
     grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
-    for row in read_table(path):
+    for row in rows:
         grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
     return grouped
 

@@ -2,16 +2,13 @@
 
 A run owns a folder: `stage_0`, `stage_1`, ... with what `recipes.train` writes, `result.json` once it is
 finished, `log.txt` with everything it printed. So a run that was killed is continued by executing it again,
-and a finished one is recognised by its result.
+and a finished one is recognised by its result. A file that is damaged is named and left as it is.
 """
 
 import dataclasses
 import fcntl
 import functools
 import importlib
-import json
-import math
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,6 +21,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import tasks
+from comparison.files import Damaged, Kind, check_kinds, plain, read_json, write_json
 from comparison.provenance import origin
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
@@ -34,6 +32,15 @@ from torchrl_sym.recipes.runs import read_progress, stage_folders, trained_folde
 EVALUATION_SEED = 1000  # the same starts for every run
 MAX_STEPS = 10_000  # of an episode in evaluation
 EXPLORATION = {"deterministic": ExplorationType.DETERMINISTIC, "sampled": ExplorationType.RANDOM}
+# What the files of a run hold.
+_NUMBER = (int, float)
+_REQUEST: dict[str, Kind] = {"task": str, "method": str, "seed": int, "stages": list, "origins": list}
+_RESULT: dict[str, Kind] = _REQUEST | {
+    **{"episodes": int, "evaluations": dict, "outcome": str, "iterations": int},
+    **{"frames": _NUMBER, "seconds": _NUMBER, "evaluation": list},
+}
+_ROW: dict[str, Kind] = {"what": str, "actions": str, "goal": str, "return": (*_NUMBER, str)}
+_ORIGIN: dict[str, Kind] = {"revision": str, "versions": dict, "machine": str}
 
 
 @dataclass(frozen=True)
@@ -64,16 +71,65 @@ class Run:
     def request(self) -> dict[str, Any]:
         """What was asked for, as JSON; numbers that are not finite as text, which JSON lacks."""
         stages = [
-            {"config": _plain(dataclasses.asdict(stage.config)), "task": _plain(stage.task)}
+            {"config": plain(dataclasses.asdict(stage.config)), "task": plain(stage.task)}
             for stage in self.setting.stages
         ]
         asked = {"task": self.task, "method": self.method, "seed": self.seed, "stages": stages}
-        return asked | {"episodes": self.episodes, "evaluations": _plain(self.setting.evaluations)}
+        return asked | {"episodes": self.episodes, "evaluations": plain(self.setting.evaluations)}
 
     def result(self) -> dict[str, Any] | None:
-        """The result, if this very run has been finished."""
-        result = _read(self.folder / "result.json")
-        return result if all(result.get(key) == value for key, value in self.request().items()) else None
+        """The result, if this very run has been finished and its file is whole; see `damage`."""
+        with contextlib.suppress(Damaged):
+            result = self._stored()
+            if all(result.get(key) == value for key, value in self.request().items()):
+                return result
+        return None
+
+    def damage(self) -> str | None:
+        """Which file of the run is damaged, and what to do about it; None if none is."""
+        try:
+            result = self._stored()
+            if result:
+                self.curve(result)
+            else:
+                self._begun()
+        except Damaged as error:
+            return str(error)
+        return None
+
+    def curve(self, result: dict[str, Any]) -> list[dict[str, float]]:
+        """The metrics of every iteration that led to a result.
+
+        Raises:
+            Damaged: some are missing, or cannot be read.
+        """
+        remedy = "restore it, or delete the folder, and the run begins anew"
+        try:
+            rows = read_curve(self.folder)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise Damaged(f"expected whole metrics in {self.folder}, got {error!r}; {remedy}") from error
+        if len(rows) != result["iterations"]:
+            raise Damaged(
+                f"expected metrics of {result['iterations']} iterations in {self.folder} (metrics.csv), "
+                f"got {len(rows)}; {remedy}"
+            )
+        return rows
+
+    def _stored(self) -> dict[str, Any]:
+        remedy = "delete it, and the run is evaluated again from its checkpoint"
+        return self._read("result.json", _RESULT, remedy)
+
+    def _begun(self) -> dict[str, Any]:
+        remedy = f"restore it, or delete {self.folder}, and the run begins anew"
+        return self._read("request.json", _REQUEST, remedy)
+
+    def _read(self, name: str, kinds: dict[str, Kind], remedy: str) -> dict[str, Any]:
+        path = self.folder / name
+        content = read_json(path, kinds, remedy)
+        for key, each in {"evaluation": _ROW, "origins": _ORIGIN}.items():
+            for row in content.get(key, []):
+                check_kinds(path, row, each, remedy)
+        return content
 
     def progress(self) -> tuple[int, float]:
         """Iterations done so far, and the latest mean return (NaN at first)."""
@@ -92,10 +148,13 @@ class Run:
 
         Raises:
             ValueError: the folder holds a run that was asked for differently.
+            Damaged: a file of the run is; nothing is overwritten.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / "lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
+            if message := self.damage():
+                raise Damaged(message)
             if self.result() is None:
                 self._execute(self._claim_folder(code or origin()))
 
@@ -105,8 +164,7 @@ class Run:
         Returns all code that it has been trained with, an origin each.
         """
         asked = {key: self.request()[key] for key in ("task", "method", "seed", "stages")}
-        path = self.folder / "request.json"
-        begun = _read(path)
+        begun = self._begun()
         if begun and any(begun.get(key) != value for key, value in asked.items()):
             raise ValueError(
                 f"expected {self.folder} to be new or to hold {self} as it is asked for now, got a run "
@@ -114,7 +172,7 @@ class Run:
             )
         origins = begun.get("origins", [])
         origins += [code] * (code not in origins)
-        write_json(path, asked | {"origins": origins})
+        write_json(self.folder / "request.json", asked | {"origins": origins})
         return origins
 
     def _execute(self, origins: list[dict[str, Any]]) -> None:
@@ -218,6 +276,9 @@ def evaluate_plainly(
 def environment(task: str, threads: int = 1) -> Callable[..., EnvBase]:
     """What makes a task's environments: called with `num_envs`, `seed` and the task's own arguments.
 
+    A module is looked for where Python finds others, then where the command was given. It is imported: let
+    no name in that was read from a file of somebody else.
+
     Raises:
         ValueError: neither a task's name nor an importable `module:function`.
     """
@@ -225,39 +286,33 @@ def environment(task: str, threads: int = 1) -> Callable[..., EnvBase]:
         return functools.partial(tasks.make_env, task, num_threads=threads)
     module, _, name = task.partition(":")
     if "" not in sys.path:
-        sys.path.insert(0, "")  # where the command was given, as `python -m` has it
+        sys.path.append("")  # last: no file there takes the place of a library or of the benchmarks
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+        make_env = getattr(importlib.import_module(module), name)
+        if not callable(make_env):
+            raise ValueError(f"{name} is a {type(make_env).__name__}")
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(
             f"expected a task of {list(tasks.ALL_TASKS)}, or module:function that takes num_envs and seed "
             f"and returns an environment with a symmetry, got {task!r} ({error})"
         ) from error
+    return make_env
 
 
 def task_setting(task: str) -> Setting:
-    """Settings of a task; of another one, what its module calls SETTING, or the recipe's defaults."""
+    """Settings of a task; of another one, what its module calls SETTING, or the recipe's defaults.
+
+    Raises:
+        ValueError: no such task, or a SETTING that is none.
+    """
     if task in SETTINGS:
         return SETTINGS[task]
     environment(task)
-    return getattr(importlib.import_module(task.partition(":")[0]), "SETTING", Setting(PPOConfig()))
-
-
-def _plain(value: Any) -> Any:
-    """A value as it comes back from JSON."""
-    if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    return value if not isinstance(value, float) or math.isfinite(value) else str(value)
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text()) if path.exists() else {}
-
-
-def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Replace a file at once: a kill leaves the old one or the new one."""
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n")
-    os.replace(partial, path)
+    module = importlib.import_module(task.partition(":")[0])
+    setting = getattr(module, "SETTING", Setting(PPOConfig()))
+    if not isinstance(setting, Setting):
+        raise ValueError(
+            f"expected SETTING of {module.__name__} ({module.__file__}) to be a tasks.settings.Setting, "
+            f"got {type(setting).__name__}; wrap the configuration: Setting(PPOConfig(...))"
+        )
+    return setting

@@ -2,15 +2,16 @@
 
 * `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
 * `curves.csv`: a row per run and logged iteration of the training.
-* `study.json`: command, commits, versions, machines; hyper-parameters per task and method; what failed.
+* `study.json`: the command that was given (until c5f032c without its `--collect` and `--extend`), commits,
+  versions, machines; hyper-parameters per task and method; what failed; what the tables hold, so that one
+  which has lost rows is noticed.
 * `policies/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
   succeed or fail; `examples/watch.py` and `behaviour.py` read it.
 """
 
 import csv
-import json
+import io
 import math
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,18 +19,23 @@ from typing import Any
 
 import numpy as np
 
+from comparison.corrections import corrected
+from comparison.files import digest, locked, stage, write_json
 from comparison.provenance import command, joint_origin, revision
 from comparison.records import (
     RUN,
+    TABLES,
     EarlierResults,
     Record,
     by_run,
+    finish_writing,
     from_folder,
     policy_folder,
-    read_table,
+    read_about,
+    rows_of,
     score,
 )
-from comparison.run import Run, write_json
+from comparison.run import Run
 from torchrl_sym.recipes import export_actor
 
 EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")  # then the behaviour
@@ -54,7 +60,7 @@ def write(
     Args:
         folder: where to.
         runs: all runs; those that have no result are left out.
-        failed: runs that failed.
+        failed: runs that failed, of which nothing is read.
         about: what else goes into `study.json`.
         points: rows per curve that are kept, at most; the last one always is.
         earlier: results with what is known of runs that are not finished in their folder.
@@ -67,7 +73,8 @@ def write(
     policies: dict[Path, list[tuple[float, Path]]] = {}  # scores and checkpoints of each method
     methods: dict[str, dict[str, Any]] = {}
     for run in runs:
-        record = from_folder(run, points) or (earlier and earlier.record(run))
+        record = None if run in failed else from_folder(run, points)
+        record = record or (earlier and earlier.record(run))
         if record is None:
             unfinished += [str(run)] * (run not in failed)
             continue
@@ -80,29 +87,38 @@ def write(
         _, best = max(scored, key=lambda pair: pair[0])
         if best != where:
             export_actor(best, where)
-    folder.mkdir(parents=True, exist_ok=True)
     evaluated = [row for record in finished for row in record.evaluated]
     first = (*RUN, "outcome", "revision", "frames", "seconds", *EVALUATION)
     behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
-    _write_table(folder / "runs.csv", (*first, *behaviour), evaluated)
     curves = [row for record in finished for row in record.curve]
-    _write_table(folder / "curves.csv", (*RUN, *CURVE), curves)
+    tables = (_table((*first, *behaviour), evaluated), _table((*RUN, *CURVE), curves))
     origins = [each for record in finished for each in record.origins]
     episodes = sorted({record.episodes for record in finished})
     collected = {"command": command(), "collected_at": revision(), "episodes": episodes}
     about = collected | joint_origin(origins) | about
     about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
-    write_json(folder / "study.json", about)
+    _write_all(folder, about, dict(zip(TABLES, tables, strict=True)))
 
 
-def _write_table(path: Path, columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> None:
+def _write_all(folder: Path, about: dict[str, Any], tables: dict[str, str]) -> None:
+    """Replace the description and its tables in one moment: that of the description."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        finish_writing(folder)
+        for name, text in tables.items():
+            stage(folder / name, text)
+        described = {name: digest(text) for name, text in tables.items()}
+        write_json(folder / "study.json", about | {"tables": described})
+        finish_writing(folder)
+
+
+def _table(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
     used = [name for name in columns if any(row.get(name) is not None for row in rows)]
-    partial = path.with_suffix(".partial")
-    with partial.open("w", newline="") as file:
-        writer = csv.DictWriter(file, used, extrasaction="ignore", restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({key: _short(value) for key, value in row.items()} for row in rows)
-    os.replace(partial, path)
+    file = io.StringIO()
+    writer = csv.DictWriter(file, used, extrasaction="ignore", restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: _short(value) for key, value in row.items()} for row in rows)
+    return file.getvalue()
 
 
 def _short(value: Any) -> Any:
@@ -116,7 +132,7 @@ class Study:
     Attributes:
         about: `study.json`.
         runs: rows of `runs.csv`; numbers as floats, None where empty.
-        curves: columns of `curves.csv` by (task, method, seed).
+        curves: columns of `curves.csv` by (task, method, seed), `corrected`.
     """
 
     about: dict[str, Any]
@@ -241,18 +257,21 @@ def read(folder: Path) -> Study:
 
     Raises:
         FileNotFoundError: there are no results.
+        Damaged: they are not as they were written.
     """
-    about = json.loads((folder / "study.json").read_text())
-    runs = [{key: _number(value) for key, value in row.items()} for row in read_table(folder / "runs.csv")]
-    curves = {
-        key: {
-            name: np.array([float(row[name] or "nan") for row in rows])
-            for name in rows[0]
-            if name not in RUN
-        }
-        for key, rows in by_run(folder / "curves.csv").items()
+    about = read_about(folder)
+    if not about:
+        raise FileNotFoundError(f"expected results in {folder} (study.json), found none; run compare.py")
+    runs, rows = (rows_of(folder, name, about) for name in TABLES)
+    revisions = {key: each[0].get("revision", "") for key, each in by_run(runs).items()}
+    curves = {key: corrected(_columns(own), revisions[key]) for key, own in by_run(rows).items()}
+    return Study(about, [{key: _number(value) for key, value in row.items()} for row in runs], curves)
+
+
+def _columns(rows: Sequence[dict[str, str]]) -> dict[str, np.ndarray]:
+    return {
+        name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0] if name not in RUN
     }
-    return Study(about, runs, curves)
 
 
 def _number(text: str) -> Any:

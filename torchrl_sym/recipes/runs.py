@@ -88,8 +88,8 @@ def read_progress(folder: str | os.PathLike) -> tuple[int, float]:
     for path in (Path(folder), *stage_folders(folder)):
         try:
             rows = read_metrics(path / "metrics.csv")
-        except (FileNotFoundError, ValueError):  # not begun; or damaged, which is its training's to say
+        except (OSError, ValueError):  # not begun; or damaged, which is its training's to say
             continue
         if rows:
-            done, latest = done + len(rows), rows[-1]["return"]
+            done, latest = done + len(rows), rows[-1].get("return", math.nan)
     return done, latest
