@@ -5,6 +5,7 @@ finished, `log.txt` with everything it printed. So a run that was killed is cont
 and a finished one is recognised by its result. A file that is damaged is named and left as it is.
 """
 
+import contextlib
 import dataclasses
 import fcntl
 import functools
