@@ -14,9 +14,10 @@ import tyro
 
 from comparison import claims, robot_claims
 from comparison.files import write_whole
+from comparison.reruns import marks
 from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
-from comparison.tables import efficiency_table, markdown, table_1
+from comparison.tables import efficiency_table, footnotes, markdown, table_1
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
@@ -31,6 +32,11 @@ _FALLS_ALONE = """In the oldest seeds the training returns of the first seven se
     were those of episodes that had fallen, and are left out (`benchmarks/comparison/corrections.py`)."""
 _SAME_BEGINNING = """The first stage of every run is that of the same method and seed of paper-repose,
     copied: the settings are the same."""
+WAITING = """Rows with a mark in the tables were trained by a rule that has changed since, and await a
+    rerun; verdicts and figures are those of the stored runs. A row without one, though trained before, had
+    by chance what the rules prescribe now: a deviation that was frozen at its cap in the last stage is that
+    of the schedule."""
+"""What marks mean for the rest of a section."""
 REMARKS = {
     "paper-push": _FALLS_ALONE,
     "paper-climb": _FALLS_ALONE,
@@ -169,6 +175,8 @@ def robot_section(name: str, study: Study) -> str:
         differ, one in ten is *confirmed* by chance, with five one in thirty; a single seed has no interval
         and decides nothing. Seconds are those of runs at different times, on a machine whose speed is not
         always the same: steps compare methods, seconds say how long to wait.""")
+    if any(marks(study, task, method) for method in study.methods(task)):
+        made += "\n\n" + prose(WAITING)
     if name in REMARKS:
         made += "\n\n" + prose(REMARKS[name])
     judged = "\n".join(
@@ -243,7 +251,7 @@ def readme_robot_block(studies: dict[str, Study]) -> str:
     missing = sum(len(study.about.get("unfinished", [])) for study in studies.values())
     if missing:
         text += "\n" + prose(f"More seeds and methods are being trained: {missing} runs.")
-    return f"{markdown(rows)}\n{text}\n"
+    return f"{markdown(rows)}{footnotes(rows)}\n{text}\n"
 
 
 def prose(text: str) -> str:

@@ -4,10 +4,12 @@ import numpy as np
 
 from comparison.intervals import estimate
 from comparison.methods import label
+from comparison.reruns import marked
 from comparison.study import Study
 from comparison.tables import (
     chance_variation,
     efficiency_table,
+    footnotes,
     last_symmetry_loss,
     markdown,
     seconds_per_step,
@@ -69,14 +71,15 @@ def success_table(
     rows = [success_row(study, task, method, actions, what) for method in methods or study.methods(task)]
     shown = list(dict.fromkeys(name for row in rows for name in row))
     head = [shown, ["---", *["---:"] * (len(shown) - 1)]]
-    return markdown(head + [[row.get(name, "-") for name in shown] for row in rows])
+    body = [[row.get(name, "-") for name in shown] for row in rows]
+    return markdown(head + body) + footnotes(body)
 
 
 def success_row(
     study: Study, task: str, method: str, actions: str = "deterministic", what: str | None = None
 ) -> dict[str, str]:
     """A row of :func:`success_table`, by column."""
-    row = {"method": label(method), "seeds": seeds_of(study, task, method)}
+    row = {"method": marked(study, task, method), "seeds": seeds_of(study, task, method)}
     figures = {
         column: study.goal_returns(task, method, column, actions, what)[1]
         for column in ("success", "task_return", "return", "turning")

@@ -1,9 +1,12 @@
 """The numbers of a comparison as Markdown: Table I of the paper, and how fast each method gets there."""
 
+import textwrap
+
 import numpy as np
 
 from comparison.intervals import estimate, iqm
 from comparison.methods import label
+from comparison.reruns import footnote, marked
 from comparison.study import Study, has_curriculum
 
 SMOOTHING = 5  # logged iterations over which a training return is averaged
@@ -16,7 +19,7 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
     rows = [head, ["---", *["---:"] * (len(head) - 1)]]
     for method in methods or study.methods(task):
         returns = study.goal_returns(task, method)[1]
-        row = [label(method), seeds_of(study, task, method)]
+        row = [marked(study, task, method), seeds_of(study, task, method)]
         if not len(returns):
             rows.append([*row, *["-"] * (len(head) - 2)])
             continue
@@ -32,7 +35,13 @@ def table_1(study: Study, task: str, methods: list[str] | None = None) -> str:
         "distance of K_g[π(s)] from π(L_g[s]) on the states of the last iteration (interquartile mean of\n"
         "logarithms).\n"
     )
-    return markdown(rows) + "\n" + note
+    return markdown(rows) + "\n" + note + footnotes(rows)
+
+
+def footnotes(rows: list[list[str]]) -> str:
+    """What the marks in a table mean."""
+    text = footnote("".join(cell for row in rows for cell in row))
+    return f"\n{textwrap.fill(text, 100)}\n" if text else ""
 
 
 def seeds_of(study: Study, task: str, method: str) -> str:
