@@ -40,8 +40,8 @@ class PPOConfig:
     """Steps per environment and iteration."""
     epochs: int = 4
     """Passes over the data of an iteration."""
-    minibatches: int = 4
-    """Minibatches per pass."""
+    minibatches: int = 8
+    """Minibatches per pass. With 4, CartPole's slowest seeds had not swung up after 3 million steps."""
 
     gamma: float = 0.98
     """Discount; 0.98 is 1 s at 50 Hz. 0.99 was slower on CartPole."""
@@ -60,14 +60,13 @@ class PPOConfig:
 
     learning_rate: float = 1e-3
     """Adam's step size, at the start if it is adaptive."""
-    desired_kl: float | None = 0.01
+    desired_kl: float | None = 0.02
     """Policy change per update that the learning rate is adapted to (rsl_rl's rule: divided by 1.5
-    above twice this value, multiplied by 1.5 below half of it). None keeps it constant."""
+    above twice this value, multiplied by 1.5 below half of it). None keeps it constant. 0.01 and 0.005
+    were slower on CartPole."""
     adapt_every: Literal["minibatch", "iteration"] = "minibatch"
-    """How often the learning rate is adapted. After every minibatch, as in rsl_rl, it climbs by 1.5 per
-    minibatch as long as the policy is near the one that collected the data, and falls as fast afterwards:
-    with 20 minibatches most steps are tiny and a few are far too large. After every iteration (by the KL
-    of the last epoch) it settles."""
+    """When the learning rate is adapted: before the step of every minibatch, by its KL, as in rsl_rl; or
+    after every iteration, by the KL of the last epoch."""
     min_learning_rate: float = 1e-5
     """Lower end of the adaptive learning rate."""
     max_learning_rate: float = 1e-2
