@@ -8,11 +8,13 @@ is the simulation: every tensor has shape (n, ...).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+
+from torchrl_sym import checks
 
 Element = int | str | Tensor
 """A group element: its index, its name, or one index per row, ``(n,)``."""
@@ -30,6 +32,10 @@ class State:
         time: time since the start of the episode, ``(n,)`` float64, s; zero when left out.
         variables: the task's own tensors by name, ``(n, ...)`` each.
 
+    Raises:
+        TypeError: something other than a tensor, or variables without names.
+        ValueError: a tensor of another shape, or of other rows than ``qpos``.
+
     Example:
         >>> import torch
         >>> state = State(torch.zeros(3, 2), torch.ones(3, 2), variables={"target": torch.eye(3)})
@@ -46,8 +52,21 @@ class State:
     _memo: dict[str, Tensor] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        n = _check_shape("qpos", self.qpos, (None, None))
         if self.time is None:
-            self.time = torch.zeros(len(self.qpos), dtype=torch.float64)
+            self.time = torch.zeros(n, dtype=torch.float64)
+        _check_shape("qvel", self.qvel, (n, None))
+        _check_shape("time", self.time, (n,))
+        if self.mocap_pos is not None:
+            _check_shape("mocap_pos", self.mocap_pos, (n, None, 3))
+        if self.mocap_quat is not None:
+            _check_shape("mocap_quat", self.mocap_quat, (n, None, 4))
+        for name, value in checks.mapping("variables", self.variables, "names to tensors").items():
+            checks.instance("name of a variable", name, str)
+            if not isinstance(value, Tensor) or value.shape[:1] != (n,):
+                raise ValueError(
+                    f"variable {name!r}: expected a tensor of {n} rows, got {checks.shown(value)}"
+                )
 
     def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """A quantity that reward, termination and observation of one step all need.
@@ -75,7 +94,12 @@ class State:
 
     def rows(self, ids: Tensor | slice) -> State:
         """A copy of some rows; ``ids`` is a slice, row numbers or a boolean mask."""
-        return self._map(lambda x: x[ids].clone())
+        try:
+            return self._map(lambda x: x[ids].clone())
+        except (IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"ids: expected a slice, row numbers below {len(self)} or a mask, got {checks.shown(ids)}"
+            ) from error
 
     def clone(self) -> State:
         """A copy that shares no memory with the simulation."""
@@ -92,8 +116,22 @@ class State:
         )
 
 
-def concatenate(states: list[State]) -> State:
+def _check_shape(name: str, value: Tensor, shape: tuple[int | None, ...]) -> int:
+    """Number of rows of a tensor; ValueError unless it has a shape, in which None stands for any size."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {checks.shown(value)}")
+    if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise ValueError(f"{name}: expected shape ({wanted}), rows first, got {tuple(value.shape)}")
+    return len(value)
+
+
+def concatenate(states: Sequence[State]) -> State:
     """The rows of several states of one task, one after the other.
+
+    Raises:
+        ValueError: no states, or states of two tasks.
+        TypeError: something other than states.
 
     Example:
         >>> import torch
@@ -106,6 +144,10 @@ def concatenate(states: list[State]) -> State:
         given = [part for part in parts if part is not None]
         return torch.cat(given) if given else None
 
+    states = [checks.instance("states", s, State) for s in checks.sequence("states", states, "states")]
+    kinds = {(s.qpos.shape[1:], *sorted(s.variables)) for s in states}
+    if len(kinds) != 1:
+        raise ValueError(f"expected states of one task, got those of {len(kinds)}")
     first = states[0]
     return State(
         qpos=torch.cat([s.qpos for s in states]),
