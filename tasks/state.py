@@ -52,21 +52,23 @@ class State:
     _memo: dict[str, Tensor] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        n = _check_shape("qpos", self.qpos, (None, None))
+        n = _rows("qpos", self.qpos, 2)
         if self.time is None:
             self.time = torch.zeros(n, dtype=torch.float64)
-        _check_shape("qvel", self.qvel, (n, None))
-        _check_shape("time", self.time, (n,))
+        _rows("qvel", self.qvel, 2, n)
+        _rows("time", self.time, 1, n)
         if self.mocap_pos is not None:
-            _check_shape("mocap_pos", self.mocap_pos, (n, None, 3))
+            _rows("mocap_pos", self.mocap_pos, 3, n, last=3)
         if self.mocap_quat is not None:
-            _check_shape("mocap_quat", self.mocap_quat, (n, None, 4))
+            _rows("mocap_quat", self.mocap_quat, 3, n, last=4)
         for name, value in checks.mapping("variables", self.variables, "names to tensors").items():
-            checks.instance("name of a variable", name, str)
-            if not isinstance(value, Tensor) or value.shape[:1] != (n,):
-                raise ValueError(
-                    f"variable {name!r}: expected a tensor of {n} rows, got {checks.shown(value)}"
-                )
+            if (
+                not isinstance(name, str)
+                or not isinstance(value, Tensor)
+                or not value.ndim
+                or len(value) != n
+            ):
+                raise ValueError(f"variable {name!r}: expected {n} rows by name, got {checks.shown(value)}")
 
     def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """A quantity that reward, termination and observation of one step all need.
@@ -116,14 +118,15 @@ class State:
         )
 
 
-def _check_shape(name: str, value: Tensor, shape: tuple[int | None, ...]) -> int:
-    """Number of rows of a tensor; ValueError unless it has a shape, in which None stands for any size."""
+def _rows(name: str, value: Tensor, ndim: int, n: int | None = None, last: int | None = None) -> int:
+    """Number of rows of a tensor of ``ndim`` dimensions; n of them, and a size ``last`` at the end."""
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a tensor, got {checks.shown(value)}")
-    if value.ndim != len(shape) or any(n not in (None, m) for n, m in zip(shape, value.shape, strict=True)):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise ValueError(f"{name}: expected shape ({wanted}), rows first, got {tuple(value.shape)}")
-    return len(value)
+    shape = value.shape
+    if len(shape) != ndim or n not in (None, shape[0]) or last not in (None, shape[-1]):
+        sizes = f"{'' if n is None else n} rows first" + f", {last} last" * (last is not None)
+        raise ValueError(f"{name}: expected {ndim} dimensions ({sizes.strip()}), got shape {tuple(shape)}")
+    return shape[0]
 
 
 def concatenate(states: Sequence[State]) -> State:
