@@ -10,16 +10,15 @@ functions of the state.
 
 from __future__ import annotations
 
-import math
-
 import mujoco
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_range, uniform
+from tasks.base import Edit, Entry, Task, check_timestep
+from tasks.draws import Range, check_range, draws, uniform
 from tasks.rotations import matrix_of
 from tasks.state import State
-from torchrl_sym import PointGroup, Representation
+from torchrl_sym import PointGroup, Representation, checks
 from torchrl_sym.representations import axial, invariant, polar
 
 LEGS = ("LF", "RF", "LH", "RH")
@@ -73,22 +72,23 @@ class Anymal(Task):
         *,
         episode_seconds: float | None = None,
         physics_timestep: float = 0.005,
-        friction: tuple[float, float] | None = None,
-        added_mass: tuple[float, float] | None = None,
+        friction: Range | None = None,
+        added_mass: Range | None = None,
         payload: float = 0.0,
         payload_position: tuple[float, float, float] = (0.0, 0.0, 0.1),
         weak_leg: str | None = None,
     ) -> None:
-        if weak_leg is not None and weak_leg not in LEGS:
-            raise ValueError(f"weak_leg: expected one of {list(LEGS)}, got {weak_leg!r}")
-        if not 0 <= payload < math.inf:
-            raise ValueError(f"payload: expected a mass >= 0 kg, got {payload}")
-        check_range("friction", friction, above=0.0)
-        edit = _edit(physics_timestep, payload, payload_position, weak_leg)
+        if weak_leg is not None:
+            checks.one_of("weak_leg", weak_leg, LEGS)
+        payload = checks.real("payload", payload, 0.0)
+        place = checks.array("payload_position", payload_position)
+        if place.shape != (3,):
+            raise ValueError(f"payload_position: expected (x, y, z) in m, got {payload_position}")
+        self.friction = check_range("friction", friction, above=0.0)
+        edit = _edit(check_timestep(physics_timestep), payload, place.tolist(), weak_leg)
         super().__init__(PointGroup.klein_four(), episode_seconds=episode_seconds, edit=edit)
         self._mass = float(self.model.body("base").mass[0])
-        check_range("added_mass", added_mass, above=-self._mass)
-        self.friction, self.added_mass = friction, added_mass
+        self.added_mass = check_range("added_mass", added_mass, above=-self._mass)
         self._pose = torch.tensor(DEFAULT_POSE, dtype=torch.float64)
         self._side_x = torch.tensor(_SIDE_X, dtype=torch.float64)
         self._side_y = torch.tensor(_SIDE_Y, dtype=torch.float64)
@@ -127,7 +127,7 @@ class Anymal(Task):
             generator: source of the noise on the joints.
         """
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
-        noise = torch.rand(n, 12, generator=generator, dtype=torch.float64) * 0.2 - 0.1
+        noise = draws(n, 12, generator) * 0.2 - 0.1
         qpos[:, 7:19] = self._pose + noise
         qpos[:, 3], qpos[:, 6] = (yaw / 2).cos(), (yaw / 2).sin()
         qpos[:, 2] = FOOT_RADIUS + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
@@ -259,11 +259,11 @@ def into_base(turn: Tensor, vector: Tensor) -> Tensor:
     return (turn * vector[:, :, None]).sum(dim=1)
 
 
-def _edit(timestep: float, payload: float, position: tuple[float, ...], weak_leg: str | None) -> Edit:
+def _edit(timestep: float, payload: float, position: list[float], weak_leg: str | None) -> Edit:
     def edit(spec) -> None:
         spec.option.timestep = timestep
         if payload > 0:
-            body = spec.body("base").add_body(name="payload", pos=list(position))
+            body = spec.body("base").add_body(name="payload", pos=position)
             sphere = mujoco.mjtGeom.mjGEOM_SPHERE  # pyright: ignore[reportAttributeAccessIssue]
             body.add_geom(
                 name="payload", type=sphere, size=[0.08, 0, 0], mass=payload, contype=0, conaffinity=0

@@ -10,15 +10,17 @@ front and back.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
 from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
-from tasks.curriculum import Averages, next_level
+from tasks.curriculum import Averages, levels, next_level
+from tasks.draws import draws
 from tasks.state import State
+from torchrl_sym import checks
 from torchrl_sym.representations import heading, height_map, invariant, polar
 
 BOX = 1.0  # half its edge, m; a cube sunk in the ground
@@ -46,6 +48,7 @@ GAIT_WEIGHTS = {"alive": 0.5, "height": -40.0, "vertical": -0.5, "rolling": -0.0
 HEADING_WEIGHTS = {"turned": -0.3}
 EFFORT_WEIGHTS = {"torque": -2e-5, "acceleration": -2.5e-7, "action_rate": -0.005}
 Phase = Literal["A", "B", "C"]
+PHASES = get_args(Phase)
 
 
 @register
@@ -85,13 +88,10 @@ class AnymalClimb(Anymal):
     def __init__(
         self, *, height: float = 0.3, phase: Phase = "A", curriculum: bool = True, **robot: Any
     ) -> None:
-        if phase not in ("A", "B", "C") or not LOWEST_BOX <= height < math.inf:
-            raise ValueError(
-                f"expected phase 'A', 'B' or 'C' and a height of at least {LOWEST_BOX} m, got {phase!r} "
-                f"and {height}"
-            )
+        self.height = checks.real("height", height, LOWEST_BOX)
+        self.phase = checks.one_of("phase", phase, PHASES)
+        self.curriculum = checks.flag("curriculum", curriculum)
         super().__init__(**robot)
-        self.height, self.phase, self.curriculum = height, phase, curriculum
         self.averages = Averages("success", "level", "distance")
         self._grid_x, self._grid_y = torch.cartesian_prod(*_axes()).unbind(-1)
         footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
@@ -113,12 +113,11 @@ class AnymalClimb(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """A box of full height in front, on the left; any heading in phase C, else towards the box."""
-        level = torch.full((n,), float(LAST_LEVEL), dtype=torch.float64)
-        return self._start(level, generator, vary=0.0)
+        return self._start(levels(n, LAST_LEVEL), generator, vary=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
-        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
         return self.mapped_at_random(self._start(level, generator, vary=0.2 * self.curriculum), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
@@ -150,7 +149,7 @@ class AnymalClimb(Anymal):
             vary: boxes are up to this share lower than the level's.
         """
         n = len(level)
-        u = torch.rand(n, 4, generator=generator, dtype=torch.float64)
+        u = draws(n, 4, generator)
         yaw = (2 * u[:, 0] - 1) * math.pi * (self.phase == "C")
         state = self.standing(n, yaw, generator)
         state.variables["level"] = level[:, None].clone()
@@ -277,9 +276,11 @@ class AnymalClimb(Anymal):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
+        phase, averages = checks.entries("saved", saved, "phase", "averages")
+        checks.one_of("phase", phase, PHASES)
+        self.averages.load(averages)
         if self.curriculum:  # without one it stays what was asked for
-            self.phase = saved["phase"]
-        self.averages.load(saved["averages"])
+            self.phase = phase
 
 
 def _axes() -> tuple[Tensor, Tensor]:

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
-from tasks.curriculum import Averages, next_level
+from tasks.curriculum import Averages, levels, next_level
+from tasks.draws import draws
 from tasks.state import State
-from torchrl_sym import Representation
+from torchrl_sym import Representation, checks
 from torchrl_sym.representations import invariant, polar
 
 CUBE = 0.3  # half its edge, m
@@ -86,7 +87,7 @@ class AnymalPush(Anymal):
 
     def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
         super().__init__(**robot)
-        self.curriculum = curriculum
+        self.curriculum = checks.flag("curriculum", curriculum)
         self.averages = Averages("success", "level")
 
     def layout(self) -> tuple[Entry, ...]:
@@ -105,12 +106,11 @@ class AnymalPush(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """Cube and target in front on the left, at any distance of the curriculum."""
-        level = torch.full((n,), float(LAST_LEVEL), dtype=torch.float64)
-        return self._start(level, generator, spread=0.0)
+        return self._start(levels(n, LAST_LEVEL), generator, spread=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Any direction; near targets, or with ``curriculum=False`` the whole range."""
-        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
         start = self._start(level, generator, spread=0.5 if self.curriculum else 0.0)
         return self.mapped_at_random(start, generator)
 
@@ -137,7 +137,7 @@ class AnymalPush(Anymal):
             spread: targets are at ``spread`` to 1 times the level's distance.
         """
         n = len(level)
-        u = torch.rand(n, 5, generator=generator, dtype=torch.float64)
+        u = draws(n, 5, generator)
         yaw = (2 * u[:, 0] - 1) * math.pi
         state = self.standing(n, yaw, generator)
         state.variables["level"] = level[:, None].clone()
@@ -227,7 +227,7 @@ class AnymalPush(Anymal):
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.load(saved["averages"])
+        self.averages.load(*checks.entries("saved", saved, "averages"))
 
 
 def facing(turn: Tensor, toward: Tensor) -> Tensor:

@@ -13,9 +13,7 @@ Every task file has the same anatomy: constants with meaning and unit, then one 
 from __future__ import annotations
 
 import abc
-import difflib
 import importlib.resources
-import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,9 +23,10 @@ import mujoco
 import torch
 from torch import Tensor
 
+from tasks.draws import check_generator
 from tasks.simulation import Simulation
 from tasks.state import Element, State, concatenate
-from torchrl_sym import PointGroup, Representation, Symmetry
+from torchrl_sym import PointGroup, Representation, Symmetry, checks
 from torchrl_sym.mujoco import derive
 
 mj: Any = mujoco  # its compiled modules have no type stubs
@@ -57,6 +56,12 @@ class Entry:
     frame: str
     kind: str
     scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        checks.instance("representation", self.representation, Representation)
+        checks.real("scale", self.scale)
+        for name in ("name", "unit", "frame", "kind"):
+            checks.instance(name, getattr(self, name), str)
 
 
 class Task(abc.ABC):
@@ -117,7 +122,7 @@ class Task(abc.ABC):
         self, group: PointGroup, *, episode_seconds: float | None = None, edit: Edit | None = None
     ) -> None:
         if episode_seconds is not None:
-            self.episode_seconds = float(episode_seconds)
+            self.episode_seconds = checks.real("episode_seconds", episode_seconds)
         if not self.control_timestep <= self.episode_seconds < math.inf:
             raise ValueError(
                 "expected finite episode_seconds of at least one control step "
@@ -168,7 +173,8 @@ class Task(abc.ABC):
     ) -> State:
         """Paired starts, n of every goal, goal by goal; of some goals only, given their elements."""
         canonical = self.sample_goal_state(n, generator)
-        goals = range(self.symmetry.group.order) if elements is None else elements
+        group = self.symmetry.group
+        goals = range(group.order) if elements is None else checks.sequence("elements", elements, "indices")
         return concatenate([self.transform_state(canonical, g) for g in goals])
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
@@ -180,7 +186,9 @@ class Task(abc.ABC):
 
     def mapped_at_random(self, state: State, generator: torch.Generator | None) -> State:
         """Every row mapped by a uniformly drawn element: makes any distribution exactly symmetric."""
-        element = torch.randint(self.symmetry.group.order, (len(state),), generator=generator)
+        check_generator(generator)
+        rows = len(checks.instance("state", state, State))
+        element = torch.randint(self.symmetry.group.order, (rows,), generator=generator)
         return self.transform_state(state, element)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
@@ -260,6 +268,7 @@ class Task(abc.ABC):
         Raises:
             KeyError: a variable that :meth:`variables` does not declare.
         """
+        checks.instance("state", state, State)
         unknown = [name for name in state.variables if name not in self._variables]
         if unknown:
             raise KeyError(
@@ -290,20 +299,9 @@ class Task(abc.ABC):
         """Continue from :meth:`state_dict`."""
 
 
-def check_range(name: str, span: tuple[float, float] | None, above: float) -> None:
-    """Refuse a range of random draws that is not rising, not finite or not above a bound.
-
-    Raises:
-        ValueError: names the argument.
-    """
-    if span is not None and not above < span[0] <= span[1] < math.inf:
-        raise ValueError(f"{name}: expected a rising range above {above:g}, got {span}")
-
-
-def uniform(span: tuple[float, float], n: int, generator: torch.Generator | None) -> Tensor:
-    """Uniform draws of a range, ``(n,)`` float64."""
-    low, high = span
-    return low + (high - low) * torch.rand(n, generator=generator, dtype=torch.float64)
+def check_timestep(timestep: float) -> float:
+    """A step of the physics, s; one of less than a microsecond would never get to the end of an episode."""
+    return checks.real("physics_timestep", timestep, 1e-6)
 
 
 def load_model(asset: str, edit: Edit | None = None) -> Any:
@@ -319,14 +317,14 @@ def load_model(asset: str, edit: Edit | None = None) -> Any:
     """
     folder = importlib.resources.files("tasks") / "assets"
     files = {f.name: f.read_bytes() for f in folder.iterdir() if f.name.endswith(".xml")}
-    if asset not in files:
+    if not isinstance(asset, str) or asset not in files:
         raise FileNotFoundError(
             f"expected {asset!r} among the files of tasks/assets, got {sorted(files)}; "
             "a missing file there means that the package was installed without its data"
         )
     spec = mj.MjSpec.from_string(files.pop(asset).decode(), include=files)
     if edit is not None:
-        edit(spec)
+        checks.function("edit", edit)(spec)
     return spec.compile()
 
 
@@ -335,7 +333,11 @@ def register(cls: T) -> T:
 
     Raises:
         ValueError: the name is taken.
+        TypeError: no task, or one without a name.
     """
+    if not isinstance(cls, type) or not issubclass(cls, Task):
+        raise TypeError(f"expected a subclass of Task, got {checks.shown(cls)}; decorate the class itself")
+    checks.instance(f"{cls.__name__}.name", getattr(cls, "name", None), str, "give the class a name")
     if cls.name in _TASKS:
         raise ValueError(
             f"expected a new task name, got {cls.name!r}, which "
@@ -365,27 +367,6 @@ def create(name: str, **task_kwargs: Any) -> Task:
         >>> create("cartpole", episode_seconds=2.0).max_steps
         100
     """
-    if name not in _TASKS:
-        close = difflib.get_close_matches(str(name), _TASKS, n=1)
-        hint = f"; did you mean {close[0]!r}?" if close else "; see tasks.ALL_TASKS"
-        raise KeyError(f"expected one of the tasks {list(_TASKS)}, got {name!r}{hint}")
-    accepted = _arguments(_TASKS[name])
-    unknown = [key for key in task_kwargs if key not in accepted]
-    if unknown:
-        raise TypeError(
-            f"expected task arguments of {name!r} among {accepted}, got {unknown}; remove or rename them"
-        )
+    checks.one_of("task", name, _TASKS, KeyError)
+    checks.refuse_unknown(f"task {name!r}", task_kwargs, checks.keywords(_TASKS[name]))
     return _TASKS[name](**task_kwargs)
-
-
-def _arguments(cls: type) -> list[str]:
-    """Keyword arguments of a constructor, with those it hands on to its base class by ``**``."""
-    names: list[str] = []
-    for ancestor in cls.__mro__:
-        if "__init__" not in vars(ancestor):
-            continue
-        parameters = inspect.signature(ancestor).parameters.values()
-        names += [p.name for p in parameters if p.kind is not p.VAR_KEYWORD]
-        if all(p.kind is not p.VAR_KEYWORD for p in parameters):
-            break
-    return names

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from tasks.base import Entry, Task, register
+from tasks.draws import draws
 from tasks.state import State
 from torchrl_sym import PointGroup
 
@@ -80,9 +81,9 @@ class CartPole(Task):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The pole lies flat to the right; noise on its angle and on both velocities."""
-        noise = torch.rand(n, 3, generator=generator, dtype=torch.float64) * 2 - 1
+        noise = draws(n, 3, generator) * 2 - 1
         noise *= START_NOISE
-        qpos = torch.zeros(n, 2, dtype=torch.float64)
+        qpos = torch.zeros(len(noise), 2, dtype=torch.float64)
         qpos[:, 1] = START_ANGLE + noise[:, 0]
         return State(qpos=qpos, qvel=noise[:, 1:])
 

@@ -7,8 +7,20 @@ import math
 import torch
 from torch import Tensor
 
+from tasks.draws import check_generator
+from torchrl_sym import checks
+
 # Weight of one episode in the running averages: they reach back about 500 episodes.
 EPISODE_WEIGHT = 0.002
+
+
+def levels(n: int, level: float) -> Tensor:
+    """The same level for n rows, ``(n,)`` float64.
+
+    Raises:
+        ValueError: a negative number of rows, or a fraction.
+    """
+    return torch.full((checks.whole("n", n, 0),), float(level), dtype=torch.float64)
 
 
 def next_level(
@@ -25,11 +37,20 @@ def next_level(
         last: the highest level.
         generator: source of the draws.
 
+    Raises:
+        ValueError: outcomes of other rows than the levels are.
+        TypeError: an argument of another type.
+
     Example:
         >>> level, yes = torch.tensor([0.0, 3.0]), torch.tensor([True, False])
         >>> next_level(level, yes, ~yes, 7, None)
         tensor([1., 2.])
     """
+    check_generator(generator)
+    for name, x in (("level", level), ("success", success), ("failure", failure)):
+        if not isinstance(x, Tensor) or x.shape != level.shape:
+            raise ValueError(f"{name}: expected a tensor with a row per level, got {checks.shown(x)}")
+    last = checks.whole("last", last, 1)
     level = (level + success.to(level.dtype) - failure.to(level.dtype)).clamp(min=0.0)
     anywhere = torch.randint(last + 1, level.shape, generator=generator).to(level.dtype)
     return torch.where(level > last, anywhere, level)
@@ -49,11 +70,14 @@ class Averages:
     """
 
     def __init__(self, *names: str) -> None:
-        self.values = dict.fromkeys(names, math.nan)
+        self.values = dict.fromkeys(checks.names("names", names), math.nan)
 
     def update(self, **episodes: Tensor) -> None:
         """Take in the figures of finished episodes, ``(n,)`` each; n may be 0."""
+        checks.refuse_unknown("Averages", episodes, list(self.values))
         for name, figures in episodes.items():
+            if not isinstance(figures, Tensor) or figures.ndim != 1:
+                raise ValueError(f"{name}: expected a tensor (n,), got {checks.shown(figures)}")
             if not len(figures):
                 continue
             mean, old = float(figures.double().mean()), self.values[name]
@@ -61,5 +85,13 @@ class Averages:
             self.values[name] = mean if math.isnan(old) else old + share * (mean - old)
 
     def load(self, values: dict[str, float]) -> None:
-        """Continue from ``values``; what another version of the task did not average begins anew."""
-        self.values = {name: values.get(name, math.nan) for name in self.values}
+        """Continue from ``values``; what another version of the task did not average begins anew.
+
+        Raises:
+            TypeError: no mapping to numbers.
+        """
+        checks.mapping("averages", values, "names to numbers")
+        for name, value in values.items():
+            if isinstance(value, bool) or not isinstance(value, float | int):
+                raise TypeError(f"average {name!r}: expected a number, got {checks.shown(value)}")
+        self.values = {name: float(values.get(name, math.nan)) for name in self.values}

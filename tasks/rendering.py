@@ -27,6 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from tasks.base import Task
 from tasks.environment import BatchedEnv
 from tasks.state import State
+from torchrl_sym import checks
 
 mj: Any = mujoco  # its compiled modules have no type stubs
 COLORS = ("tab:blue", "tab:orange", "tab:green", "tab:red", "tab:purple", "tab:brown")
@@ -54,6 +55,10 @@ def record(
     Returns:
         ``steps + 1`` states, ``start`` first.
 
+    Raises:
+        TypeError: an argument of another type.
+        ValueError: a start of another number of rows, or steps that are none.
+
     Example:
         >>> import tasks, torch
         >>> env = tasks.make_env("cartpole", num_envs=2, num_threads=1)
@@ -61,10 +66,13 @@ def record(
         >>> len(record(env, env.rand_action, start, steps=5))
         6
     """
-    tensordict: TensorDictBase = env.reset_to(start)
+    checks.instance("env", env, BatchedEnv, "tasks.make_env makes one")
+    checks.function("policy", policy)
+    count = env.task.max_steps if steps is None else checks.whole("steps", steps, 0)
+    tensordict: TensorDictBase = env.reset_to(checks.instance("start", start, State))
     states = [env.state]
     with torch.no_grad(), set_exploration_type(exploration):
-        for _ in range(env.task.max_steps if steps is None else steps):
+        for _ in range(count):
             tensordict = step_mdp(env.step(policy(tensordict)))
             states.append(env.state)
     return states
@@ -93,7 +101,8 @@ def render(
     Raises:
         RuntimeError: no OpenGL.
         KeyError: no such camera.
-        ValueError: larger than the model's frame buffer.
+        ValueError: larger than the model's frame buffer, or states of another task.
+        TypeError: an argument of another type.
 
     Example:
         >>> from tasks.base import create
@@ -102,13 +111,16 @@ def render(
         >>> render(task, [start], width=64, height=48)[0].shape
         (2, 48, 64, 3)
     """
-    model = copy.copy(task.model)
+    model = copy.copy(checks.instance("task", task, Task).model)
+    states = _states_of(task, states)
+    width = checks.whole("width (within the model's framebuffer)", width, 1, model.vis.global_.offwidth)
+    height = checks.whole("height (within the model's framebuffer)", height, 1, model.vis.global_.offheight)
     model.vis.map.shadowclip = 1.5  # see _aim_lights
     names = [model.camera(i).name for i in range(model.ncam)]
     if camera is None:
         camera = "overview" if "overview" in names or not names else names[0]
-    elif camera not in names:
-        raise KeyError(f"expected one of the cameras {names}, got {camera!r}")
+    else:
+        checks.one_of("camera", camera, names, KeyError)
     data = mj.MjData(model)
     renderer = _renderer(model, height, width)
     try:
@@ -124,6 +136,15 @@ def render(
     finally:
         renderer.close()
     return images
+
+
+def _states_of(task: Task, states: Sequence[State]) -> list[State]:
+    """The states; ValueError unless all are of this task."""
+    found = [checks.instance("states", s, State) for s in checks.sequence("states", states, "states")]
+    size = task.model.nq
+    if any(state.qpos.shape[1] != size for state in found):
+        raise ValueError(f"states: expected those of {task.name!r}, with positions (n, {size}), got others")
+    return found
 
 
 def _renderer(model: Any, height: int, width: int) -> Any:
@@ -169,12 +190,22 @@ def sheet(rows: Sequence[Sequence[np.ndarray]], captions: Sequence[Sequence[str]
     Returns:
         One image, uint8; places without an image are white.
 
+    Raises:
+        ValueError: no images, of two sizes, or not a caption for each.
+        TypeError: something other than images and captions.
+
     Example:
         >>> import numpy as np
         >>> image = np.zeros((20, 30, 3), dtype=np.uint8)
         >>> sheet([[image, image], [image]], [["right", "left"], [""]]).shape
         (40, 60, 3)
     """
+    rows = [_images("rows", row) for row in checks.sequence("rows", rows, "rows of images")]
+    captions = [checks.sequence("captions", row) for row in checks.sequence("captions", captions, "rows")]
+    if not rows or len({image.shape for row in rows for image in row}) != 1:
+        raise ValueError("rows: expected images of one size, at least one row")
+    if [len(row) for row in rows] != [len(row) for row in captions]:
+        raise ValueError("captions: expected one per image")
     height, width = rows[0][0].shape[:2]
     picture = Image.new("RGB", (width * max(map(len, rows)), height * len(rows)), "white")
     draw = ImageDraw.Draw(picture)
@@ -184,8 +215,21 @@ def sheet(rows: Sequence[Sequence[np.ndarray]], captions: Sequence[Sequence[str]
             corner = (j * width, i * height)
             picture.paste(Image.fromarray(image), corner)
             place = (corner[0] + height // 30, corner[1] + height // 40)
+            text = checks.instance("captions", text, str)
             draw.text(place, text, fill="#202020", font=font, stroke_width=2, stroke_fill="white")
     return np.asarray(picture)
+
+
+def _images(name: str, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Images of one size; TypeError or ValueError otherwise."""
+    found = checks.sequence(name, images, of="images")
+    for image in found:
+        checks.instance(name, image, np.ndarray)
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise ValueError(f"{name}: expected uint8 (height, width, 3), got {checks.shown(image)}")
+    if len({image.shape for image in found}) != 1:
+        raise ValueError(f"{name}: expected images of one size, at least one, got {len(found)}")
+    return found
 
 
 def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.0) -> None:
@@ -197,7 +241,8 @@ def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.
         fps: frames per second.
 
     Raises:
-        ValueError: another suffix, or not one frame for a png.
+        ValueError: another suffix, no frames or not one for a png, or no frames per second.
+        TypeError: something other than frames.
         ImportError: mp4 without imageio-ffmpeg.
 
     Example:
@@ -206,7 +251,10 @@ def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     save(f"{folder}/film.gif", [image, image])
     """
-    path = Path(path)
+    path = Path(checks.instance("path", path, (str, os.PathLike)))
+    if path.suffix not in (".png", ".gif", ".mp4"):
+        raise ValueError(f"expected a file name that ends in .png, .gif or .mp4, got {path.name!r}")
+    frames, fps = _images("frames", frames), checks.real("fps", fps, above=0.0)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".png":
         if len(frames) != 1:
@@ -218,10 +266,8 @@ def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.
     elif path.suffix == ".gif":
         images = [Image.fromarray(frame).quantize(128) for frame in frames]
         images[0].save(path, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
-    elif path.suffix == ".mp4":
-        _save_mp4(path, frames, fps)
     else:
-        raise ValueError(f"expected a file name that ends in .png, .gif or .mp4, got {path.name!r}")
+        _save_mp4(path, frames, fps)
 
 
 def _save_mp4(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
@@ -253,7 +299,8 @@ def overlay(task: Task, states: Sequence[State], elements: Sequence[int]) -> Fig
         The figure; arrows show headings, squares targets.
 
     Raises:
-        ValueError: nothing in the model has a free joint.
+        ValueError: nothing in the model has a free joint, no states, or not an element for every row.
+        KeyError: no such element.
 
     Example:
         >>> from tasks.base import create
@@ -294,9 +341,14 @@ def draw_paths(
         headings: an arrow every half second.
 
     Raises:
-        ValueError: nothing in the model has a free joint.
+        ValueError: as in :func:`overlay`.
+        KeyError: no such element.
     """
+    states = _states_of(checks.instance("task", task, Task), states)
     model, group = task.model, task.symmetry.group
+    elements = [group.index(g) for g in checks.sequence("elements", elements, "elements")]
+    if {len(state) for state in states} != {len(elements)}:
+        raise ValueError(f"elements: expected one per row of the states, got {len(elements)}")
     free = [j for j in range(model.njnt) if model.jnt_type[j] == mj.mjtJoint.mjJNT_FREE]
     if not free:
         raise ValueError(

@@ -8,11 +8,13 @@ is the simulation: every tensor has shape (n, ...).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+
+from torchrl_sym import checks
 
 Element = int | str | Tensor
 """A group element: its index, its name, or one index per row, ``(n,)``."""
@@ -30,6 +32,10 @@ class State:
         time: time since the start of the episode, ``(n,)`` float64, s; zero when left out.
         variables: the task's own tensors by name, ``(n, ...)`` each.
 
+    Raises:
+        TypeError: something other than a tensor, or variables without names.
+        ValueError: a tensor of another shape, or of other rows than ``qpos``.
+
     Example:
         >>> import torch
         >>> state = State(torch.zeros(3, 2), torch.ones(3, 2), variables={"target": torch.eye(3)})
@@ -46,8 +52,23 @@ class State:
     _memo: dict[str, Tensor] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        n = _rows("qpos", self.qpos, 2)
         if self.time is None:
-            self.time = torch.zeros(len(self.qpos), dtype=torch.float64)
+            self.time = torch.zeros(n, dtype=torch.float64)
+        _rows("qvel", self.qvel, 2, n)
+        _rows("time", self.time, 1, n)
+        if self.mocap_pos is not None:
+            _rows("mocap_pos", self.mocap_pos, 3, n, last=3)
+        if self.mocap_quat is not None:
+            _rows("mocap_quat", self.mocap_quat, 3, n, last=4)
+        for name, value in checks.mapping("variables", self.variables, "names to tensors").items():
+            if (
+                not isinstance(name, str)
+                or not isinstance(value, Tensor)
+                or not value.ndim
+                or len(value) != n
+            ):
+                raise ValueError(f"variable {name!r}: expected {n} rows by name, got {checks.shown(value)}")
 
     def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """A quantity that reward, termination and observation of one step all need.
@@ -75,7 +96,12 @@ class State:
 
     def rows(self, ids: Tensor | slice) -> State:
         """A copy of some rows; ``ids`` is a slice, row numbers or a boolean mask."""
-        return self._map(lambda x: x[ids].clone())
+        try:
+            return self._map(lambda x: x[ids].clone())
+        except (IndexError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"ids: expected a slice, row numbers below {len(self)} or a mask, got {checks.shown(ids)}"
+            ) from error
 
     def clone(self) -> State:
         """A copy that shares no memory with the simulation."""
@@ -92,8 +118,23 @@ class State:
         )
 
 
-def concatenate(states: list[State]) -> State:
+def _rows(name: str, value: Tensor, ndim: int, n: int | None = None, last: int | None = None) -> int:
+    """Number of rows of a tensor of ``ndim`` dimensions; n of them, and a size ``last`` at the end."""
+    if not isinstance(value, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {checks.shown(value)}")
+    shape = value.shape
+    if len(shape) != ndim or n not in (None, shape[0]) or last not in (None, shape[-1]):
+        sizes = f"{'' if n is None else n} rows first" + f", {last} last" * (last is not None)
+        raise ValueError(f"{name}: expected {ndim} dimensions ({sizes.strip()}), got shape {tuple(shape)}")
+    return shape[0]
+
+
+def concatenate(states: Sequence[State]) -> State:
     """The rows of several states of one task, one after the other.
+
+    Raises:
+        ValueError: no states, or states of two tasks.
+        TypeError: something other than states.
 
     Example:
         >>> import torch
@@ -106,6 +147,10 @@ def concatenate(states: list[State]) -> State:
         given = [part for part in parts if part is not None]
         return torch.cat(given) if given else None
 
+    states = [checks.instance("states", s, State) for s in checks.sequence("states", states, "states")]
+    kinds = {(s.qpos.shape[1:], *sorted(s.variables)) for s in states}
+    if len(kinds) != 1:
+        raise ValueError(f"expected states of one task, got those of {len(kinds)}")
     first = states[0]
     return State(
         qpos=torch.cat([s.qpos for s in states]),

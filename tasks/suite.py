@@ -23,6 +23,7 @@ from torch import Tensor
 
 from tasks.base import Task, create
 from tasks.state import State
+from torchrl_sym import checks
 
 
 class OneSimulation:
@@ -54,8 +55,9 @@ class SuiteTask(control.Task):
 
     def __init__(self, description: Task, random: int | np.random.RandomState | None = None) -> None:
         if not isinstance(random, np.random.RandomState):
-            random = np.random.RandomState(random)
-        self.description = description
+            seed = None if random is None else checks.whole("random", random, 0, 2**32 - 1)
+            random = np.random.RandomState(seed)
+        self.description = checks.instance("description", description, Task, "tasks.base.create makes one")
         self._generator = torch.Generator().manual_seed(int(random.randint(2**31)))
         self._state: State | None = None
         self._fresh = True

@@ -18,11 +18,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_range, register, uniform
-from tasks.curriculum import Averages, next_level
+from tasks.base import Edit, Entry, Task, check_timestep, register
+from tasks.curriculum import Averages, levels, next_level
+from tasks.draws import Range, check_range, draws, uniform
 from tasks.rotations import matrix_of
 from tasks.state import State
-from torchrl_sym import PointGroup, Representation
+from torchrl_sym import PointGroup, Representation, checks
 from torchrl_sym.representations import invariant, polar, quaternion
 
 FINGERS = ("0", "1", "2")
@@ -106,37 +107,33 @@ class TrifingerRepose(Task):
         curriculum: bool = True,
         episode_seconds: float | None = None,
         physics_timestep: float = 0.005,
-        cube_mass: tuple[float, float] | None = None,
-        friction: tuple[float, float] | None = None,
+        cube_mass: Range | None = None,
+        friction: Range | None = None,
         weak_finger: int | None = None,
     ) -> None:
-        if difficulty not in (1, 2, 3, 4):
-            raise ValueError(f"expected a difficulty of 1, 2, 3 or 4, got {difficulty!r}")
-        if yaw is not None and not (difficulty == 1 and 0 < yaw <= math.pi):
+        self.difficulty = difficulty = checks.whole("difficulty", difficulty, 1, 4)
+        self.yaw = None if yaw is None else checks.real("yaw", yaw, above=0.0, high=math.pi)
+        if yaw is not None and difficulty != 1:
             raise ValueError(
-                f"expected a yaw in (0, pi] rad at difficulty 1, got {yaw} at {difficulty}; difficulty 4 "
-                "has orientations of its own"
+                f"expected a yaw at difficulty 1 only, got {yaw} at {difficulty}; difficulty 4 has "
+                "orientations of its own"
             )
-        if not 0 < radius <= ARENA or weak_finger not in (None, 0, 1, 2):
-            raise ValueError(
-                f"expected a radius in (0, {ARENA}] m and a weak_finger among 0, 1, 2 or None, got "
-                f"{radius} and {weak_finger!r}"
-            )
-        check_range("cube_mass", cube_mass, above=0.0)
-        check_range("friction", friction, above=0.0)
-        self.difficulty, self.yaw, self.radius = difficulty, yaw, radius
+        self.radius = checks.real("radius", radius, above=0.0, high=ARENA)
+        if weak_finger is not None:
+            weak_finger = checks.whole("weak_finger", weak_finger, 0, 2)
+        self.curriculum = checks.flag("curriculum", curriculum)
+        self.cube_mass = check_range("cube_mass", cube_mass, above=0.0)
+        self.friction = check_range("friction", friction, above=0.0)
         self.oriented = difficulty == 4 or yaw is not None
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
-        edit = _edit(physics_timestep, weak_finger)
+        edit = _edit(check_timestep(physics_timestep), weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
-        self.cube_mass, self.friction = cube_mass, friction
         self._start_pose = torch.from_numpy(self.model.qpos0[:9].copy())
         self._torque = float(self.model.actuator_ctrlrange[0, 1])  # the same for all
         turns = -torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
         self._turn = torch.stack([turns.cos(), turns.sin()])
         signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
         self._corners = torch.cartesian_prod(signs, signs, signs)
-        self.curriculum = curriculum
         self.averages = Averages("success", "error", "level", *["angle"] * self.oriented)
 
     def layout(self) -> tuple[Entry, ...]:
@@ -163,11 +160,11 @@ class TrifingerRepose(Task):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
-        return self._start(torch.full((n,), float(LAST_LEVEL), dtype=torch.float64), generator)
+        return self._start(levels(n, LAST_LEVEL), generator)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """All goals; the first level, or with ``curriculum=False`` the last."""
-        level = torch.full((n,), 0.0 if self.curriculum else LAST_LEVEL, dtype=torch.float64)
+        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
         return self.mapped_at_random(self._start(level, generator), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
@@ -191,7 +188,7 @@ class TrifingerRepose(Task):
     def _start(self, level: Tensor, generator: torch.Generator | None) -> State:
         n = len(level)
         radius = self.radius * (FIRST_SHARE + (1 - FIRST_SHARE) * level / LAST_LEVEL)
-        u = torch.rand(n, 17, generator=generator, dtype=torch.float64)
+        u = draws(n, 17, generator)
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
         anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)

@@ -300,17 +300,23 @@ def test_without_ranges_nothing_is_drawn():
     ("kwargs", "message"),
     [
         ({"weak_leg": "FL"}, r"expected one of \['LF', 'RF', 'LH', 'RH'\], got 'FL'"),
-        ({"payload": -1.0}, r"payload: expected a mass >= 0 kg, got -1.0"),
-        ({"payload": float("nan")}, "payload: expected a mass >= 0 kg, got nan"),
+        ({"payload": -1.0}, r"payload: expected a finite number of at least 0, got -1.0"),
+        ({"payload": float("nan")}, "payload: expected a finite number of at least 0, got nan"),
         ({"friction": (1.0, 0.5)}, r"friction: expected a rising range above 0, got \(1.0, 0.5\)"),
         ({"friction": (0.0, 0.5)}, r"friction: expected a rising range above 0, got \(0.0, 0.5\)"),
         ({"added_mass": (-40.0, -35.0)}, r"added_mass: expected a rising range above -26.373"),
         ({"added_mass": (2.0, -2.0)}, r"added_mass: expected a rising range.*got \(2.0, -2.0\)"),
         ({"physics_timestep": 0.015}, r"multiple of the model's timestep 0.015 s, got 0.02 s; change"),
-        ({"physics_timestep": 0.0}, "multiple of the model's timestep 0.0 s"),
-        ({"physics_timestep": -0.01}, "multiple of the model's timestep -0.01 s"),
+        (
+            {"physics_timestep": 0.0},
+            "physics_timestep: expected .* of at least 1e-06, got 0.0",
+        ),
+        (
+            {"physics_timestep": -0.01},
+            "physics_timestep: expected .* of at least 1e-06, got -0.01",
+        ),
         ({"episode_seconds": 0.01}, "at least one control step"),
-        ({"episode_seconds": float("inf")}, "finite episode_seconds.*got inf"),
+        ({"episode_seconds": float("inf")}, "episode_seconds: expected a finite number, got inf"),
     ],
     ids=str,
 )
@@ -323,7 +329,7 @@ def test_arguments_that_make_no_sense_are_refused(name, kwargs, message):
 @robots
 @pytest.mark.parametrize("function", [tasks.make_env, tasks.load])
 def test_unknown_arguments_list_inherited_ones_too(name, function):
-    with pytest.raises(TypeError, match=r"'curriculum'.*'payload'.*'weak_leg'.*got \['gravity'\]; remove"):
+    with pytest.raises(TypeError, match=r"'curriculum'.*'payload'.*'weak_leg'.*got 'gravity'"):
         function(name, gravity=3.0)
 
 

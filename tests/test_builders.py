@@ -137,7 +137,7 @@ def test_a_ring_is_closed_under_thirds_of_a_turn():
         (ring(4), "C3", r"not closed under 'rot-120': point 0 at \(0.5, 0\) is sent to \(-0.25, 0.433\)"),
         (ring(5) + 0.1, "reflect-y", "not closed under 'reflect-y'.*center the layout on the axis"),
         ([[0.1, 0.2], [0.1, 0.2]], "trivial", "expected distinct points, got two within 1e-06 m"),
-        ([[0.1, float("nan")]], "trivial", "expected finite positions, got NaN or infinity"),
+        ([[0.1, float("nan")]], "trivial", "positions: expected finite numbers, got NaN or infinity"),
         ([[0.1]], "trivial", r"expected positions of shape \(P, 2\) or \(P, 3\), got \(1, 1\)"),
         (torch.zeros(0, 2), "trivial", r"expected positions of shape .* got \(0, 2\)"),
         (ring(4), "cube", "a group that fixes the vertical axis"),
@@ -246,7 +246,7 @@ def test_reflections_refuse_to_act_from_the_left(builder):
 
 @pytest.mark.parametrize("builder", [rotation_matrix, rotation_6d, quaternion])
 def test_action_is_left_or_conjugate(builder):
-    with pytest.raises(ValueError, match="expected action 'left' or 'conjugate', got 'right'"):
+    with pytest.raises(ValueError, match=r"action: expected one of \['left', 'conjugate'\], got 'right'"):
         builder(PointGroup.rotation(3), "right")
 
 

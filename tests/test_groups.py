@@ -220,7 +220,7 @@ NAN = torch.full((3, 3), math.nan)
     [
         (torch.eye(3), r"expected matrices of shape \(N, 3, 3\), got \(3, 3\)"),
         (torch.eye(2)[None], r"expected matrices of shape \(N, 3, 3\), got \(1, 2, 2\)"),
-        (torch.zeros(0, 3, 3), r"at least the identity"),
+        (torch.zeros(0, 3, 3), r"expected 1 to 120 elements, got 0; list the identity"),
         (torch.stack([EYE, 2 * EYE]), "expected orthogonal matrices, got element 1"),
         (torch.stack([EYE, NAN]), "expected orthogonal matrices, got element 1 = .*nan"),
         (torch.stack([QUARTER_TURN, EYE]), "expected the identity as element 0; list it first"),
@@ -237,7 +237,7 @@ def test_bad_elements_are_refused(matrices, message):
 @pytest.mark.parametrize("names", [["e"], ["e", "e"], ["e", "f", "g"]])
 def test_names_must_be_distinct_and_one_per_element(names):
     mirror = torch.diag(torch.tensor([-1.0, 1, 1]))
-    with pytest.raises(ValueError, match="expected 2 distinct names"):
+    with pytest.raises(ValueError, match=r"expected (2 )?distinct names"):
         PointGroup(torch.stack([EYE, mirror]), names)
 
 
@@ -273,7 +273,7 @@ def test_reflection_takes_a_horizontal_axis(axis):
 @pytest.mark.parametrize("build", [PointGroup.rotation, PointGroup.dihedral])
 @pytest.mark.parametrize("n", [0, -3, 2.5])
 def test_number_of_turns_is_positive(build, n):
-    with pytest.raises(ValueError, match=f"expected a positive number of turns n, got {n}"):
+    with pytest.raises(ValueError, match=f"n: expected a whole number from 1 to .*, got {n}"):
         build(n)
 
 

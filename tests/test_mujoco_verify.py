@@ -318,7 +318,7 @@ def test_errors_say_what_to_do():
         verify(load("pendulum swingup"), symmetry(orientation="+-", velocity="--", action="-"))
     with pytest.raises(ValueError, match="'action': the environment takes 1 entries"):
         verify(env, symmetry(observation="---", action="--"))
-    with pytest.raises(ValueError, match="at least one state"):
+    with pytest.raises(ValueError, match="states: expected a whole number from 1"):
         verify(env, env.symmetry, states=0)
     with pytest.raises(KeyError, match="expected one of"):
         verify(env, env.symmetry).of("everything")

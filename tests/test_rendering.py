@@ -54,7 +54,7 @@ def test_rendering_leaves_the_model_alone_and_follows_mocap_bodies():
 
 def test_unknown_cameras_and_large_pictures():
     task = base.create("cartpole")
-    with pytest.raises(KeyError, match=r"expected one of the cameras \['side'\], got 'top'"):
+    with pytest.raises(KeyError, match=r"camera: expected one of \['side'\], got 'top'"):
         render(task, [], camera="top")
     with pytest.raises(ValueError, match="framebuffer"):
         render(task, [], width=4000)

@@ -219,7 +219,7 @@ def test_representations_of_different_groups_do_not_add():
 
 @pytest.mark.parametrize("times", [0, -1, 1.5])
 def test_repetitions_are_a_positive_number(times):
-    with pytest.raises(ValueError, match=f"expected a positive number of repetitions, got {times}"):
+    with pytest.raises(ValueError, match=f"repetitions: expected a whole number from 1 .*, got {times}"):
         scalar(PointGroup.trivial()) * times
 
 

@@ -104,7 +104,7 @@ def test_set_keys_refuses_an_action_that_the_symmetry_lacks():
 
 
 def test_bad_arguments_are_errors():
-    with pytest.raises(ValueError, match="expected mirror_coeff >= 0, got -1"):
+    with pytest.raises(ValueError, match="mirror_coeff: expected a finite number of at least 0, got -1"):
         make_loss(mirror_coeff=-1.0)
     with pytest.raises(ValueError, match="expected 'all', 'random' or a sequence of names"):
         make_loss(elements="some")

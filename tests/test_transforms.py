@@ -213,8 +213,8 @@ def test_copies_of_the_transform_act_alike(duplicate):
 @pytest.mark.parametrize(
     "settings, error, message",
     [
-        ({"layout": "concat"}, ValueError, "expected layout 'cat' or 'stack', got 'concat'"),
-        ({"when": "add"}, ValueError, "expected when='sample' or 'extend', got 'add'"),
+        ({"layout": "concat"}, ValueError, "layout: expected one of .*, got 'concat'"),
+        ({"when": "add"}, ValueError, "when: expected one of .*, got 'add'"),
         ({"elements": "reflect-y"}, ValueError, "expected 'all', 'random' or a sequence of names"),
         ({"elements": ["reflect-z"]}, KeyError, "no element 'reflect-z'"),
     ],

@@ -11,10 +11,14 @@ from __future__ import annotations
 
 import functools
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from torchrl_sym import checks
 
 _TOLERANCE = 1e-9
 _DISTINCT = 1e-6  # elements that differ by less are one and the same
@@ -59,13 +63,15 @@ class PointGroup:
             names: one distinct name per element. Defaults to names read off the matrices.
 
         Raises:
-            ValueError: a matrix is not orthogonal, the identity is not first, or the set is not closed.
+            ValueError: a matrix is not orthogonal, the identity is not first, the set is not closed, or
+                has more than 120 elements.
+            TypeError: no matrices, or names that are none.
         """
-        matrices = torch.as_tensor(matrices, dtype=torch.float64)
+        matrices = checks.array("matrices", matrices, finite=False)
         if matrices.ndim != 3 or matrices.shape[1:] != (3, 3):
             raise ValueError(f"expected matrices of shape (N, 3, 3), got {tuple(matrices.shape)}")
-        if len(matrices) == 0:
-            raise ValueError("expected at least the identity, got no elements")
+        if not 1 <= len(matrices) <= _MAX_ORDER:
+            raise ValueError(f"expected 1 to {_MAX_ORDER} elements, got {len(matrices)}; list the identity")
         eye = torch.eye(3, dtype=torch.float64)
         for i, matrix in enumerate(matrices):
             if not torch.allclose(matrix @ matrix.T, eye, rtol=0, atol=_TOLERANCE):
@@ -76,7 +82,7 @@ class PointGroup:
         if not torch.allclose(matrices[0], eye, rtol=0, atol=_TOLERANCE):
             raise ValueError("expected the identity as element 0; list it first")
         self.matrices = _snap(matrices)
-        self.names = tuple(names) if names is not None else tuple(map(_name, self.matrices))
+        self.names = tuple(map(_name, self.matrices) if names is None else checks.names("names", names))
         if len(set(self.names)) != len(matrices) or len(self.names) != len(matrices):
             raise ValueError(
                 f"expected {len(matrices)} distinct names, got {list(self.names)}; "
@@ -116,7 +122,7 @@ class PointGroup:
             axis: ``"x"`` (front and back change places) or ``"y"`` (left and right change places).
         """
         normals = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
-        if axis not in normals:
+        if not isinstance(axis, str) or axis not in normals:
             raise ValueError(
                 f"expected axis 'x' or 'y', got {axis!r}; a reflection that moves gravity or another "
                 "plane can be built with PointGroup.generate"
@@ -125,8 +131,8 @@ class PointGroup:
 
     @classmethod
     def rotation(cls, n: int) -> PointGroup:
-        """The n turns by multiples of 360/n degrees about the vertical axis, C_n."""
-        _check_fold(n)
+        """The n turns by multiples of 360/n degrees about the vertical axis, C_n; n is 1 to 120."""
+        n = checks.whole("n", n, 1, _MAX_ORDER)
         return cls.generate({"turn": _turn(2 * math.pi / n)} if n > 1 else {})
 
     @classmethod
@@ -136,8 +142,12 @@ class PointGroup:
 
     @classmethod
     def dihedral(cls, n: int) -> PointGroup:
-        """The n turns of C_n and n reflections in vertical planes, one of which is y -> -y; order 2n."""
-        _check_fold(n)
+        """The n turns of C_n and n reflections in vertical planes, one of which is y -> -y; order 2n.
+
+        Args:
+            n: number of turns, 1 to 60.
+        """
+        n = checks.whole("n", n, 1, _MAX_ORDER // 2)
         return cls.generate({"turn": _turn(2 * math.pi / n), "mirror": _mirror(0.0, 1.0)})
 
     @classmethod
@@ -160,8 +170,9 @@ class PointGroup:
         """
         eye = torch.eye(3, dtype=torch.float64)
         moves = {}
-        for name, value in generators.items():
-            matrix = torch.as_tensor(value, dtype=torch.float64)
+        checks.flag("fixes_vertical", fixes_vertical)
+        for name, value in checks.mapping("generators", generators, "names to matrices").items():
+            matrix = checks.array(f"generator {name!r}", value, finite=False)
             if matrix.shape != (3, 3) or not torch.allclose(
                 matrix @ matrix.mT, eye, rtol=0, atol=_TOLERANCE
             ):
@@ -182,11 +193,11 @@ class PointGroup:
                 if all((candidate - f).abs().max() > _DISTINCT for f in found):
                     found.append(candidate)
                     words.append(name if word == "identity" else f"{name}*{word}")
-            if len(found) > _MAX_ORDER:
-                raise ValueError(
-                    f"the generators {list(moves)} do not close to a finite group of at most "
-                    f"{_MAX_ORDER} elements; check their angles (a divisor of 360 degrees?)"
-                )
+                if len(found) > _MAX_ORDER:
+                    raise ValueError(
+                        f"the generators {reprlib.repr(list(moves))} do not close to a finite group of at "
+                        f"most {_MAX_ORDER} elements; check their angles (a divisor of 360 degrees?)"
+                    )
         order = sorted(range(len(found)), key=lambda i: _sort_key(found[i]))
         names = [_name(found[i], fallback=words[i]) for i in order]
         return cls(torch.stack([found[i] for i in order]), names)
@@ -202,9 +213,11 @@ class PointGroup:
             if element not in self.names:
                 raise KeyError(f"no element {element!r} in this group, which has {list(self.names)}")
             return self.names.index(element)
+        if type(element) is not int:  # on the path of every call of a representation
+            element = checks.whole("an element's index (or its name)", element)
         if not 0 <= element < self.order:
             raise KeyError(f"expected an element index in [0, {self.order}), got {element}")
-        return int(element)
+        return element
 
     def subgroup(self, elements: Sequence[int | str]) -> PointGroup:
         """The subgroup generated by some of the elements.
@@ -213,7 +226,7 @@ class PointGroup:
             >>> PointGroup.dihedral(4).subgroup(["rot-90"]).order
             4
         """
-        chosen = [self.index(e) for e in elements]
+        chosen = [self.index(e) for e in checks.sequence("elements", elements)]
         members, frontier = {0}, {0}
         while frontier:
             reached = {int(self.table[g, h]) for g in chosen for h in frontier}
@@ -250,6 +263,15 @@ class PointGroup:
         return f"PointGroup({', '.join(self.names)})"
 
 
+def check_group(group: Any) -> PointGroup:
+    """The group, if it is one.
+
+    Raises:
+        TypeError: it is not.
+    """
+    return checks.instance("group", group, PointGroup, "PointGroup.reflection('y') makes one")
+
+
 def _turn(angle: float) -> Tensor:
     c, s = math.cos(angle), math.sin(angle)
     return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -258,11 +280,6 @@ def _turn(angle: float) -> Tensor:
 def _mirror(nx: float, ny: float) -> Tensor:
     normal = torch.tensor([nx, ny, 0.0], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
-
-
-def _check_fold(n: int) -> None:
-    if n < 1 or int(n) != n:
-        raise ValueError(f"expected a positive number of turns n, got {n}")
 
 
 def _snap(matrices: Tensor) -> Tensor:

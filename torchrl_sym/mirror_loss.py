@@ -17,13 +17,14 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, dispatch
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
 from torch import Tensor
 from torchrl.modules import OneHotCategorical
 from torchrl.objectives import LossModule
 
+from torchrl_sym import checks
 from torchrl_sym.representations import Representation, invariant
-from torchrl_sym.symmetry import Symmetry
+from torchrl_sym.symmetry import Symmetry, check_symmetry
 
 
 class MirrorLoss(LossModule):
@@ -41,7 +42,7 @@ class MirrorLoss(LossModule):
 
     Keyword Args:
         symmetry: what transforms how; must declare everything that the network reads.
-        coeff: weight w; schedulable (``loss.coeff = 0.1``). Defaults to 1.
+        coeff: weight w, finite and not negative; schedulable (``loss.coeff = 0.1``). Defaults to 1.
         stop_gradient: treat K_g[pi(s)] as a label. Defaults to ``True``, as in the paper.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
         per_element: also return ``mirror_error``, the unweighted error of each element, ``(N,)``.
@@ -49,6 +50,8 @@ class MirrorLoss(LossModule):
 
     Raises:
         KeyError: the network reads or writes a key that the symmetry does not declare.
+        ValueError: a weight or a reduction that is none.
+        TypeError: an argument of another type, or of a name that is not above.
 
     Example:
         >>> import torch
@@ -84,6 +87,7 @@ class MirrorLoss(LossModule):
     coeff: Tensor
     _schedulable_buffers = frozenset({"coeff"})
 
+    @checks.near_names
     def __init__(
         self,
         actor_network: TensorDictModule,
@@ -95,7 +99,10 @@ class MirrorLoss(LossModule):
         per_element: bool = False,
         functional: bool = True,
     ) -> None:
-        self._functional = functional
+        check_network("actor_network", actor_network)
+        check_symmetry(symmetry)
+        checks.real("coeff", coeff, 0.0)
+        self._functional = checks.flag("functional", functional)
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
         super().__init__()
@@ -104,14 +111,11 @@ class MirrorLoss(LossModule):
         else:
             self.actor_network = actor_network
             self.actor_network_params = None  # type: ignore[assignment]
-        if not coeff >= 0:
-            raise ValueError(f"expected coeff >= 0, got {coeff}")
-        if reduction not in (None, "none", "mean", "sum"):
-            raise ValueError(f"expected reduction 'none', 'mean' or 'sum', got {reduction!r}")
         self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
-        self.stop_gradient = stop_gradient
-        self.per_element = per_element
-        self.reduction = "mean" if reduction is None else reduction
+        self.stop_gradient = checks.flag("stop_gradient", stop_gradient)
+        self.per_element = checks.flag("per_element", per_element)
+        reduction = "mean" if reduction is None else reduction
+        self.reduction = checks.one_of("reduction", reduction, ("none", "mean", "sum"))
         self.register_coeff_buffer("coeff", coeff)
         self._follow_network()
         if self._is_policy():  # any other output may still be named with set_keys
@@ -212,6 +216,12 @@ class MirrorLoss(LossModule):
         )
         self._clear_weakrefs(td_out, "actor_network_params", "target_actor_network_params")
         return td_out
+
+
+def check_network(name: str, network: TensorDictModule) -> None:
+    """TypeError unless a network reads and writes tensordicts."""
+    remedy = "wrap a network in TensorDictModule, ProbabilisticActor or ValueOperator"
+    checks.instance(name, network, TensorDictModuleBase, remedy)
 
 
 def single_action(actor: TensorDictModule) -> NestedKey:

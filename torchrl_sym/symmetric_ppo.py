@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import contextlib
 import copy
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
@@ -24,9 +26,19 @@ from torchrl.objectives.ppo import (
     _check_advantage_broadcast,
 )
 
-from torchrl_sym.mirror_loss import batched, deterministic_action, single_action, squared_distance
+from torchrl_sym import checks
+from torchrl_sym.mirror_loss import (
+    batched,
+    check_network,
+    deterministic_action,
+    single_action,
+    squared_distance,
+)
 from torchrl_sym.rows import DrawnRows, OrbitRows
-from torchrl_sym.symmetry import Elements, Symmetry
+from torchrl_sym.symmetry import Elements, Symmetry, check_symmetry
+
+# Numbers of ClipPPOLoss and the least they may be; a negative weight of the entropy has its uses.
+_LEAST = {"clip_epsilon": 0.0, "critic_coeff": 0.0, "clip_value": 0.0, "entropy_coeff": None}
 
 
 class SymmetricClipPPOLoss(ClipPPOLoss):
@@ -51,12 +63,16 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         elements: ``"all"``; names of a subset (the identity is always kept); or ``"random"``: each row
             is mapped by one uniformly drawn element, which has the same expected gradient at 1/N of the
             cost. Diagnostics and entropy then come from the rows that drew the identity.
-        mirror_coeff: weight w of the mirror loss (Eq. symm-loss), added as ``loss_mirror``; it reuses
-            the actor's pass over the orbit. 0 leaves it out. Schedulable when positive.
-        **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts.
+        mirror_coeff: weight w of the mirror loss (Eq. symm-loss), finite and not negative, added as
+            ``loss_mirror``; it reuses the actor's pass over the orbit. 0 leaves it out. Schedulable when
+            positive.
+        **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts, and nothing that it would ignore.
 
     Raises:
-        KeyError: a network reads a key, or the action is one, that the symmetry does not declare.
+        KeyError: a network reads a key, or the action is one, that the symmetry does not declare; or
+            there is no such element.
+        ValueError: a number that is not finite or out of range.
+        TypeError: an argument of another type, or of a name that neither loss knows.
 
     Example:
         >>> import torch
@@ -103,12 +119,25 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         mirror_coeff: float = 0.0,
         **clip_ppo_kwargs,
     ) -> None:
+        check_symmetry(symmetry)
+        checks.real("mirror_coeff", mirror_coeff, 0.0)
+        _check_numbers(clip_ppo_kwargs)
+        actor = clip_ppo_kwargs.get("actor", actor_network)
+        check_network("actor_network", actor)
+        if not hasattr(actor, "get_dist"):
+            raise TypeError(
+                "actor_network: expected a distribution of actions; wrap it in ProbabilisticActor"
+            )
+        critic = clip_ppo_kwargs.get("critic", critic_network)
+        if critic is not None:
+            check_network("critic_network", critic)
         super().__init__(actor_network, critic_network, **clip_ppo_kwargs)
+        # afterwards, for TorchRL has messages of its own for names that it has removed
+        accepted = checks.keywords(SymmetricClipPPOLoss)
+        checks.refuse_unknown(type(self).__name__, clip_ppo_kwargs, accepted)
         self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
         self.random = elements == "random" and symmetry.group.order > 1  # else there is nothing to draw
         self.elements = symmetry.elements(elements)
-        if not mirror_coeff >= 0:
-            raise ValueError(f"expected mirror_coeff >= 0, got {mirror_coeff}")
         self._mirrors = mirror_coeff > 0
         if self._mirrors:
             self.register_coeff_buffer("mirror_coeff", mirror_coeff)
@@ -257,6 +286,21 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             return value
         per_original = name in ("loss_entropy", "loss_mirror")
         return self._reduce_loss(value, rows.td if per_original else rows.expanded).squeeze(-1)
+
+
+def _check_numbers(arguments: Mapping[str, Any]) -> None:
+    """Weights and bounds are finite, which ``ClipPPOLoss`` leaves open: a loss of NaN is no error there."""
+    for name in arguments.keys() & _LEAST.keys():
+        value = arguments[name]
+        if (value is None and name != "clip_epsilon") or (name == "clip_value" and isinstance(value, bool)):
+            continue  # a default, or the bound of the ratio
+        parts = [value]
+        if name == "clip_epsilon" and isinstance(value, tuple | list) and len(value) == 2:
+            parts = list(value)  # below and above
+        if name == "entropy_coeff" and isinstance(value, Mapping):
+            parts = list(value.values())  # one for each head
+        for part in parts:
+            checks.real(name, part, _LEAST[name])
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:

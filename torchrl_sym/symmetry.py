@@ -12,12 +12,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, is_tensor_collection
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations import Representation
 from torchrl_sym.specs import check_box, check_normalizers, check_size
 
@@ -49,8 +50,9 @@ class Symmetry(nn.Module):
             starting with ``_``). With ``False`` they are copied unchanged.
 
     Raises:
-        TypeError: a value is not a representation.
-        ValueError: a representation belongs to another group.
+        TypeError: a value is not a representation, or a key is none.
+        ValueError: a representation belongs to another group, a key is that of a ``"next"`` entry, or two
+            keys are spellings of one.
 
     Example:
         >>> import torch
@@ -75,7 +77,8 @@ class Symmetry(nn.Module):
         strict: bool = True,
     ) -> None:
         super().__init__()
-        if not representations:
+        check_group(group)
+        if not checks.mapping("representations", representations, "keys to representations"):
             raise ValueError("expected at least one key with its representation, got none")
         for key, value in representations.items():
             if not isinstance(value, Representation):
@@ -89,8 +92,8 @@ class Symmetry(nn.Module):
                     "it for this group or use representation.restrict(group)"
                 )
         self.group = group
-        self.strict = strict
-        self._keys = [unravel_key(key) for key in representations]
+        self.strict = checks.flag("strict", strict)
+        self._keys = _distinct_keys(representations)
         self.representations = nn.ModuleList(representations.values())
         self._table: dict[NestedKey, Representation] = dict(
             zip(self._keys, representations.values(), strict=True)
@@ -118,7 +121,7 @@ class Symmetry(nn.Module):
         Raises:
             KeyError: the key is not declared; the message lists those that are.
         """
-        if key not in self:
+        if checks.key("key", key) not in self:
             raise KeyError(
                 f"no representation for {key!r}; this symmetry has {self._keys}. Add it to the "
                 "dictionary passed to Symmetry, e.g. invariant(group, d) if no element changes it"
@@ -127,6 +130,7 @@ class Symmetry(nn.Module):
 
     def require(self, keys: Iterable[NestedKey], reader: str) -> None:
         """Raise KeyError unless every key is declared, or of a kind that copies share."""
+        keys = [checks.key("keys", key) for key in checks.sequence("keys", keys)]
         missing = [key for key in keys if key not in self and not _is_shared(key)]
         if any("recurrent_state" in _split(key)[1] for key in missing):
             raise KeyError(
@@ -142,16 +146,17 @@ class Symmetry(nn.Module):
 
     def elements(self, elements: Elements) -> list[int]:
         """Indices of ``"all"`` elements, or of the identity and the named ones, originals first."""
-        if elements == "all" or elements == "random":
+        if isinstance(elements, str) and elements in ("all", "random"):
             return list(range(self.group.order))
         if isinstance(elements, str):
             raise ValueError(
                 f"expected 'all', 'random' or a sequence of names from {list(self.group.names)}, got "
                 f"{elements!r}"
             )
+        elements = checks.sequence("elements", elements)
         named = [self.group.index(e) for e in elements]
         if not named or len(set(named)) != len(named):
-            raise ValueError(f"expected distinct element names, at least one, got {list(elements)}")
+            raise ValueError(f"expected distinct element names, at least one, got {elements}")
         return [0, *(g for g in named if g != 0)]
 
     def forward(
@@ -169,10 +174,11 @@ class Symmetry(nn.Module):
             keys: what to map; every other entry is shared. Defaults to all that is declared.
 
         Raises:
-            KeyError: an entry that the symmetry should know but does not (strict).
+            KeyError: an entry that the symmetry should know but does not (strict, or named by ``keys``).
             ValueError: a tensor's last dimension differs from its representation's.
+            TypeError: no tensordict.
         """
-        out = tensordict.copy()
+        out = check_batch(tensordict).copy()
         for key, representation, value in self._mapped(tensordict, keys):
             out.set(key, representation(value, g))
         return out
@@ -193,8 +199,12 @@ class Symmetry(nn.Module):
             elements: indices of the elements to apply. Defaults to all of the group.
             keys: what to map; every other entry is shared. Defaults to all that is declared.
         """
+        if elements is not None:
+            elements = checks.sequence("elements", elements, of="indices")
         count = self.group.order if elements is None else len(elements)
-        out = tensordict.expand(count, *tensordict.batch_size).copy()
+        if count == 0:
+            raise ValueError("elements: expected at least one element, got none")
+        out = check_batch(tensordict).expand(count, *tensordict.batch_size).copy()
         for key, representation, value in self._mapped(tensordict, keys):
             if elements is None:
                 images = representation.orbit(value)
@@ -204,8 +214,13 @@ class Symmetry(nn.Module):
         return out
 
     def _mapped(self, tensordict: TensorDictBase, keys: Iterable[NestedKey] | None):
-        for key in tensordict.keys(include_nested=True, leaves_only=True) if keys is None else keys:
-            representation = self._resolve(key)
+        strict = self.strict or keys is not None  # what is asked for by name must be known
+        if keys is None:
+            chosen = tensordict.keys(include_nested=True, leaves_only=True)
+        else:
+            chosen = [checks.key("keys", key) for key in checks.sequence("keys", keys, of="keys")]
+        for key in chosen:
+            representation = self._resolve(key, strict)
             if representation is not None:
                 value = tensordict.get(key, None)
                 if isinstance(value, Tensor):
@@ -217,7 +232,7 @@ class Symmetry(nn.Module):
                         )
                     yield key, representation, value
 
-    def _resolve(self, key: NestedKey) -> Representation | None:
+    def _resolve(self, key: NestedKey, strict: bool) -> Representation | None:
         """Representation of a batch entry, None if copies share it, KeyError if it is unknown."""
         bare = _without_next(unravel_key(key))
         if bare in self._table:
@@ -230,7 +245,7 @@ class Symmetry(nn.Module):
                     "invariant(group, d) if all its entries are equal"
                 )
             return self._written[bare]
-        if self.strict and not _is_shared(bare):
+        if strict and not _is_shared(bare):
             raise KeyError(
                 f"the batch has {key!r}, which this symmetry does not know (it has {self._keys}); add "
                 "its representation, e.g. invariant(group, d) if no element changes it, drop it with "
@@ -251,6 +266,7 @@ class Symmetry(nn.Module):
             ValueError: a size differs, a box is not symmetric, or a running normaliser, which L_g does
                 not commute with, is applied to a declared observation.
         """
+        checks.instance("env", env, EnvBase)
         check_normalizers(env, self._keys)
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
             for key, spec in specs.items(include_nested=True, leaves_only=True):
@@ -267,6 +283,37 @@ class Symmetry(nn.Module):
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self._keys}"
+
+
+def check_batch(tensordict: TensorDictBase) -> TensorDictBase:
+    """TypeError unless it is a tensordict (or a tensorclass)."""
+    if not is_tensor_collection(type(tensordict)):
+        raise TypeError(f"expected a tensordict, got {checks.shown(tensordict)}")
+    return tensordict
+
+
+def check_symmetry(symmetry: Symmetry) -> Symmetry:
+    """TypeError unless it is a symmetry."""
+    return checks.instance("symmetry", symmetry, Symmetry, "build Symmetry(group, {key: representation})")
+
+
+def _distinct_keys(keys: Iterable[NestedKey]) -> list[NestedKey]:
+    """The keys of a symmetry in their shortest spelling."""
+    found: dict[NestedKey, NestedKey] = {}
+    for spelling in keys:
+        key = checks.key("representations", spelling)
+        bare = _without_next(key)
+        if bare != key or key == "next":
+            raise ValueError(
+                f"expected keys without 'next', got {spelling!r}; declare the entry itself, whose "
+                "representation the one under 'next' follows"
+            )
+        if key in found:
+            raise ValueError(
+                f"expected distinct keys, got {found[key]!r} and {spelling!r}; declare one of them"
+            )
+        found[key] = spelling
+    return list(found)
 
 
 def _is_shared(key: NestedKey) -> bool:

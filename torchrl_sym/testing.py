@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sym import checks
 from torchrl_sym.representations import Representation, invariant
 from torchrl_sym.symmetry import Symmetry
 
@@ -26,12 +27,16 @@ def assert_representation(representation: Representation, *, tolerance: float = 
 
     Raises:
         AssertionError: with the element or pair at fault.
+        TypeError: no representation, or no number.
+        ValueError: a tolerance that is negative or not finite, under which nothing, or anything, passes.
 
     Example:
         >>> from torchrl_sym import PointGroup
         >>> from torchrl_sym.representations import polar
         >>> assert_representation(polar(PointGroup.dihedral(3)))
     """
+    checks.instance("representation", representation, Representation)
+    tolerance = checks.real("tolerance", tolerance, 0.0)
     group, matrices = representation.group, representation.matrices
     eye = torch.eye(representation.dim, dtype=matrices.dtype)
     residual = (matrices[0] - eye).abs().amax() if representation.dim else torch.zeros(())
@@ -70,7 +75,10 @@ def assert_equivariant(
 
     Raises:
         AssertionError: with element, output entry and the two values that should agree.
-        ValueError: the output's size is not that of ``out_rep``.
+        ValueError: the output's size is not that of ``out_rep``, the representations belong to two groups,
+            there are no inputs or other than finite ones, not a name for every output, or a tolerance that
+            is negative or not finite.
+        TypeError: an argument of another type.
 
     Example:
         >>> import torch
@@ -83,9 +91,16 @@ def assert_equivariant(
         ...
         AssertionError: not equivariant under 'reflect-x': entry 0 of the output is ..., expected ...
     """
+    checks.function("module", module)
+    group = checks.instance("in_rep", in_rep, Representation).group
+    if out_rep is not None and checks.instance("out_rep", out_rep, Representation).group != group:
+        raise ValueError(f"out_rep: expected a representation of {group}, got one of {out_rep.group}")
+    tolerance = checks.real("tolerance", tolerance, 0.0)
+    generator = torch.Generator().manual_seed(checks.whole("seed", seed, 0))
     if inputs is None:
-        generator = torch.Generator().manual_seed(seed)
         inputs = torch.randn(64, in_rep.dim, generator=generator)
+    if not checks.array("inputs", checks.instance("inputs", inputs, Tensor)).numel():
+        raise ValueError(f"inputs: expected rows to test on, got {checks.shown(inputs)}")
     with torch.no_grad():
         output = module(inputs)
         if out_rep is None:
@@ -94,6 +109,8 @@ def assert_equivariant(
             raise ValueError(
                 f"expected an output of size {out_rep.dim}, as of out_rep, got {tuple(output.shape)}"
             )
+        if names is not None and len(checks.names("names", names)) != out_rep.dim:
+            raise ValueError(f"names: expected {out_rep.dim}, one per output, got {checks.shown(names)}")
         bound = tolerance * max(1.0, float(output.abs().max()))
         for g, element in enumerate(in_rep.group.names):
             got, expected = module(in_rep(inputs, g)), out_rep(output, g)

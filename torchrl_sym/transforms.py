@@ -23,7 +23,8 @@ from torchrl.data.replay_buffers import SampleUnit
 from torchrl.data.replay_buffers.samplers import SliceSampler
 from torchrl.envs.transforms import Transform
 
-from torchrl_sym.symmetry import Elements, Symmetry
+from torchrl_sym import checks
+from torchrl_sym.symmetry import Elements, Symmetry, check_batch, check_symmetry
 
 _TRAJECTORY = ("collector", "traj_ids")
 
@@ -59,7 +60,10 @@ class SymmetryAugment(Transform):
             before any update (stand-alone, postproc or extend time).
 
     Raises:
-        KeyError: the batch has an entry that the symmetry does not know, or lacks a declared one.
+        KeyError: the batch has an entry that the symmetry does not know, or lacks a declared one; or
+            there is no such element.
+        ValueError: an argument that is none of those above.
+        TypeError: an argument of another type, or of a name that is not above.
         RuntimeError: used where it cannot work; the message says what to use instead.
 
     Example:
@@ -80,6 +84,7 @@ class SymmetryAugment(Transform):
         tensor([ 1.,  1.,  1.,  1., -1., -1., -1., -1.])
     """
 
+    @checks.near_names
     def __init__(
         self,
         symmetry: Symmetry,
@@ -90,17 +95,22 @@ class SymmetryAugment(Transform):
         select: Sequence[NestedKey] | None = None,
         log_prob_from: ProbabilisticTensorDictSequential | None = None,
     ) -> None:
-        if layout not in ("cat", "stack"):
-            raise ValueError(f"expected layout 'cat' or 'stack', got {layout!r}")
-        if when not in ("sample", "extend"):
-            raise ValueError(f"expected when='sample' or 'extend', got {when!r}")
+        check_symmetry(symmetry)
+        checks.one_of("layout", layout, ("cat", "stack"))
+        checks.one_of("when", when, ("sample", "extend"))
+        if select is not None:
+            select = [checks.key("select", key) for key in checks.sequence("select", select, of="keys")]
+            if not select:
+                raise ValueError("select: expected keys to keep, got none; leave it out to keep them all")
+        if log_prob_from is not None:
+            checks.instance("log_prob_from", log_prob_from, ProbabilisticTensorDictSequential)
         super().__init__(in_keys=symmetry.keys(), out_keys=symmetry.keys())
         self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
-        self.random = elements == "random"
+        self.random = isinstance(elements, str) and elements == "random"
         self.elements = symmetry.elements(elements)
         self.layout = layout
         self.when = when
-        self.select = None if select is None else list(select)
+        self.select = select
         self.__dict__["log_prob_from"] = log_prob_from  # the actor is the caller's, not a submodule
 
     def set_container(self, container: Any) -> None:
@@ -114,7 +124,7 @@ class SymmetryAugment(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Augment a batch (a no-op with ``when="extend"``, and for a single record)."""
-        if self.when != "sample" or tensordict.batch_dims == 0:
+        if self.when != "sample" or check_batch(tensordict).batch_dims == 0:
             return tensordict
         if not torch.compiler.is_compiling():
             self._check_sampling(_calling_buffer()[0])
@@ -146,7 +156,9 @@ class SymmetryAugment(Transform):
         Returns:
             ``[N * B, ...]`` or ``[*B, N]`` as by ``layout``, or ``[B, ...]`` with random elements.
         """
-        td = tensordict if self.select is None else tensordict.select(*self.select)
+        td = check_batch(tensordict)
+        if self.select is not None:
+            td = td.select(*self.select)
         if td.batch_dims == 0:
             raise RuntimeError(
                 "expected at least one batch dimension, got batch size []; use td.unsqueeze(0)"
@@ -284,8 +296,10 @@ class SymmetryOrbit(SampleUnit):
         tensor([ 1.,  1.,  1.,  1., -1., -1., -1., -1.])
     """
 
+    @checks.near_names
     def __init__(self, symmetry: Symmetry, elements: Elements = "all") -> None:
-        if elements == "random":
+        check_symmetry(symmetry)
+        if isinstance(elements, str) and elements == "random":
             raise ValueError(
                 "random elements keep the number of records; use SymmetryAugment(elements='random')"
             )
@@ -330,7 +344,10 @@ class SymmetryOrbit(SampleUnit):
         A prioritized buffer keeps the last value written for an index, so update it with
         ``buffer.update_priority(td["index"][:B], orbit.fold(error))``.
         """
-        return priority.unflatten(0, (len(self.elements), -1)).amax(dim=0)
+        copies = len(self.elements)
+        if not isinstance(priority, Tensor) or priority.ndim == 0 or len(priority) % copies:
+            raise ValueError(f"expected priorities of {copies} copies each, got {checks.shown(priority)}")
+        return priority.unflatten(0, (copies, -1)).amax(dim=0)
 
 
 class _OrbitTransform(Transform):

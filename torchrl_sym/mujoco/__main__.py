@@ -12,6 +12,7 @@ from typing import Annotated
 
 import tyro
 
+from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.audit import audit
 from torchrl_sym.mujoco.derive import derive
@@ -51,10 +52,10 @@ def named_group(name: str) -> PointGroup:
         >>> named_group("rotation-3").names
         ('identity', 'rot-120', 'rot-240')
     """
-    kind, _, fold = name.partition("-")
+    kind, _, fold = checks.instance("group", name, str).partition("-")
     if name in GROUPS:
         return GROUPS[name]()
-    if kind in ("rotation", "dihedral") and fold.isdigit():
+    if kind in ("rotation", "dihedral") and fold.isdecimal():
         return getattr(PointGroup, kind)(int(fold))
     raise ValueError(f"expected one of {list(GROUPS)}, rotation-N or dihedral-N, got {name!r}")
 

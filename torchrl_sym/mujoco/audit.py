@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.mujoco import geoms
 from torchrl_sym.mujoco.derive import ModelSymmetry, derive
 from torchrl_sym.mujoco.elements import Image
@@ -27,6 +28,7 @@ from torchrl_sym.mujoco.links import (
     Array,
     MjModel,
     carried_bodies,
+    check_model,
     links_of,
     mj,
     name_of,
@@ -73,7 +75,9 @@ def audit(
         >>> audit(model, PointGroup.reflection("y")).verdict
         'approximate (largest residual 0.02: inertia, reflect-y, ...)'
     """
-    carried_bodies(model, carried)  # a mistake of the call is no finding about the model
+    # a mistake of the call is no finding about the model
+    carried_bodies(check_model(model), carried)
+    tolerance, group = checks.real("tolerance", tolerance, 0.0), check_group(group)
     elements = tuple(group.names[1:])
     warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
     try:

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.coordinates import quaternion, rotation
 from torchrl_sym.mujoco.derive import derive
@@ -78,7 +79,8 @@ class Averager:
         tolerance: float,
         carried: Sequence[str],
     ) -> None:
-        self.spec = spec.copy()
+        remedy = "a specification is what is changed: MjSpec.from_file(path)"
+        self.spec = checks.instance("spec", spec, mj.MjSpec, remedy).copy()
         self.spec.compiler.fusestatic = False  # fused bodies have no specification to write to
         self.model = self.spec.compile()
         self.tolerance, self.keyframe, self.group = tolerance, keyframe, group

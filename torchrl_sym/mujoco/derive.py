@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.mujoco.coordinates import CoordinateMap, map_coordinates, quaternion
 from torchrl_sym.mujoco.elements import (
     Image,
@@ -29,6 +30,8 @@ from torchrl_sym.mujoco.links import (
     Matcher,
     MjModel,
     carried_bodies,
+    check_mocap,
+    check_model,
     links_of,
     name_of,
     reference_pose,
@@ -83,8 +86,9 @@ def derive(
         >>> robot.table("joint", "reflect-y")
         {'left': '-right', 'right': '-left'}
     """
-    gravity = torch.as_tensor(np.array(model.opt.gravity))
-    for name, matrix in zip(group.names, group.matrices, strict=True):
+    gravity = torch.as_tensor(np.array(check_model(model).opt.gravity))
+    tolerance = checks.real("tolerance", tolerance, 0.0)
+    for name, matrix in zip(check_group(group).names, group.matrices, strict=True):
         if not torch.allclose(matrix @ gravity, gravity, atol=1e-9):
             raise ValueError(
                 f"{name!r} tilts gravity {gravity.tolist()}; use a group that fixes the vertical axis, or "
@@ -267,7 +271,7 @@ class ModelSymmetry:
             ValueError: an element sends one of them to a joint that is not among them.
         """
         known = {name_of(self.model, "joint", j): j for j in self._scalar}
-        missing = [name for name in names if name not in known]
+        missing = [name for name in checks.names("joints", names, least=0) if name not in known]
         if missing:
             raise KeyError(f"no hinge or slide joints {missing}; the model has {list(known)}")
         return self._joint_representation([known[name] for name in names])
@@ -296,7 +300,7 @@ class ModelSymmetry:
             ValueError: a reading has no linear image, or an element sends a sensor to one not named.
         """
         known = {name_of(self.model, "sensor", i): i for i in range(self.model.nsensor)}
-        missing = [name for name in names if name not in known]
+        missing = [name for name in checks.names("sensors", names, least=0) if name not in known]
         if missing:
             raise KeyError(f"no sensors {missing}; the model has {list(known)}")
         return self._sensor_representation([known[name] for name in names])
@@ -321,8 +325,7 @@ class ModelSymmetry:
             "tendon": action.tendons,
             "sensor": self._sensors[self.group.index(g)].images if kind == "sensor" else {},
         }
-        if kind not in images:
-            raise ValueError(f"expected one of {list(images)}, got {kind!r}")
+        checks.one_of("kind", kind, images)
         return {
             name_of(self.model, kind, a): "-" * (image.sign < 0) + name_of(self.model, kind, image.index)
             for a, image in sorted(images[kind].items())
@@ -373,6 +376,7 @@ class ModelSymmetry:
 
     def map_mocap(self, position: Tensor, rotation: Tensor, g: int | str | Tensor) -> tuple[Tensor, Tensor]:
         """Image of mocap poses ``(..., nmocap, 3)`` and ``(..., nmocap, 4)``."""
+        check_mocap(self.model, position, rotation)
         images = (
             representation(x.flatten(-2), g).unflatten(-1, x.shape[-2:])
             for representation, x in ((self._mocap_position, position), (self._mocap_rotation, rotation))

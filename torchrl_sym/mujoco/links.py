@@ -20,6 +20,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from torchrl_sym import checks
 
 Array = NDArray[np.float64]
 mj: Any = mujoco  # its compiled modules have no type stubs
@@ -57,6 +60,41 @@ def name_of(model: MjModel, kind: str, index: int) -> str:
     return getattr(model, kind)(index).name or f"{kind} {index}"
 
 
+@functools.cache
+def _numbers() -> list[str]:
+    """Names of a model's arrays of real numbers."""
+    model = mj.MjSpec().compile()
+    fields = (name for name in dir(model) if not name.startswith("_"))
+    values = {name: getattr(model, name) for name in fields}
+    return [n for n, x in values.items() if isinstance(x, np.ndarray) and x.dtype.kind == "f"]
+
+
+def check_model(model: MjModel) -> MjModel:
+    """A compiled model with anything in it, all of whose numbers are finite.
+
+    Raises:
+        TypeError: a specification, a file name, data, ...
+        ValueError: nothing but the world, or NaN or infinity in a field; the message names it.
+    """
+    remedy = "spec.compile(), MjModel.from_xml_path(path) or physics.model.ptr of dm_control give one"
+    checks.instance("model", model, mj.MjModel, remedy)
+    if model.nbody == 1 and not (model.ngeom or model.nsite):
+        raise ValueError("model: expected bodies, got the empty world; is this the file of the robot?")
+    for name in _numbers():
+        if not np.isfinite(getattr(model, name)).all():
+            raise ValueError(f"model: expected finite numbers, got NaN or infinity in {name}")
+    return model
+
+
+def check_mocap(model: MjModel, position: Any, rotation: Any) -> None:
+    """ValueError unless these are tensors of poses of the model's mocap bodies."""
+    for name, x, size in (("position", position, 3), ("rotation", rotation, 4)):
+        if not isinstance(x, Tensor) or x.shape[-2:] != (model.nmocap, size):
+            raise ValueError(
+                f"{name}: expected a tensor (..., {model.nmocap}, {size}), got {checks.shown(x)}"
+            )
+
+
 def reference_pose(model: MjModel, keyframe: int | str | None) -> MjData:
     """Kinematics at the pose that the group is expected to keep: qpos0, or a keyframe.
 
@@ -65,14 +103,22 @@ def reference_pose(model: MjModel, keyframe: int | str | None) -> MjData:
     """
     data = mj.MjData(model)
     if keyframe is not None:
-        names = [model.key(i).name for i in range(model.nkey)]
-        index = names.index(keyframe) if keyframe in names else keyframe
-        if not isinstance(index, int) or not 0 <= index < model.nkey:
-            raise KeyError(f"no keyframe {keyframe!r}; the model has {names or 'none'}")
-        mj.mj_resetDataKeyframe(model, data, index)
+        mj.mj_resetDataKeyframe(model, data, _number_of(model, keyframe))
     mj.mj_kinematics(model, data)
     mj.mj_comPos(model, data)
     return data
+
+
+def _number_of(model: MjModel, keyframe: int | str) -> int:
+    names = [model.key(i).name or None for i in range(model.nkey)]
+    try:
+        return (
+            names.index(keyframe)
+            if isinstance(keyframe, str)
+            else checks.whole("keyframe", keyframe, 0, model.nkey - 1)
+        )
+    except ValueError as error:
+        raise KeyError(f"no keyframe {keyframe!r}; the model has {names or 'none'}") from error
 
 
 def links_of(model: MjModel, data: MjData) -> dict[int, Link]:
@@ -103,8 +149,9 @@ def carried_bodies(model: MjModel, names: Sequence[str]) -> frozenset[int]:
     loose = ((model.body_jntnum > 0) & (kinds == FREE)) | (model.body_mocapid >= 0)
     known = {name_of(model, "body", b): b for b in range(model.nbody)}
     found = set()
-    for name in (names,) if isinstance(names, str) else names:
-        if name not in known:
+    names = [names] if isinstance(names, str) else checks.sequence("carried", names)
+    for name in names:
+        if not isinstance(name, str) or name not in known:
             choice = [n for n, b in known.items() if loose[b]]
             raise KeyError(f"no body {name!r} to be carried; free and mocap bodies are {choice}")
         body = known[name]

@@ -297,6 +297,11 @@ def subject_of(env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int
     """
     if not hasattr(env, "base_env"):
         if hasattr(env, "reset_to") and hasattr(getattr(env, "task", None), "transform_state"):
+            if pose != Pose():
+                raise ValueError(
+                    "expected neither keyframe nor carried for a batched task environment, which maps its "
+                    f"state itself, got {pose.keyframe!r} and {pose.carried!r}; leave them out"
+                )
             return BatchedSubject(env, symmetry, observe, seed)
         if all(hasattr(env, name) for name in ("physics", "task", "action_spec")):
             return ControlSubject(env, symmetry, observe, pose, seed)

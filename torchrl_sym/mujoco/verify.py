@@ -21,10 +21,11 @@ import torch
 from scipy import stats
 from torch import Tensor
 
+from torchrl_sym import checks
 from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
 from torchrl_sym.mujoco.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
 from torchrl_sym.specs import image_of_box
-from torchrl_sym.symmetry import Symmetry
+from torchrl_sym.symmetry import Symmetry, check_symmetry
 
 # In the order of cause: a wrong part makes those after it wrong as well. States come before observations,
 # which may contain forces, and on which no state depends.
@@ -33,6 +34,7 @@ PARTS = (
     *("next observation", "rollout", "reset"),
 )
 MAX_WARM_UP = 50  # random actions before a state is tested
+MOST = 100_000  # states, or steps: more would take days
 RESETS = 400  # starts in each of the two samples that are compared
 SIGNIFICANCE = 1e-3  # chance that a symmetric start distribution fails, over all entries and elements
 FLOAT32_TOLERANCE = 2e-6  # rounding of observations and rewards in single precision
@@ -99,8 +101,7 @@ class VerifyReport:
 
     def of(self, part: str) -> list[VerifyRow]:
         """Rows of one part."""
-        if part not in PARTS:
-            raise KeyError(f"expected one of {list(PARTS)}, got {part!r}")
+        checks.one_of("part", part, PARTS, KeyError)
         return [row for row in self.rows if row.part == part]
 
     def __str__(self) -> str:
@@ -159,7 +160,8 @@ def verify(
     Raises:
         TypeError: an environment of another kind.
         KeyError: an observation, or the action, is not declared.
-        ValueError: a size differs from its representation's.
+        ValueError: a size differs from its representation's; a number out of its range; or a keyframe or
+            carried bodies for a task environment, which would ignore them.
         SymmetryError: the model does not have the group, or a body cannot be carried by an element.
 
     Example:
@@ -168,13 +170,17 @@ def verify(
         >>> verify(env, env.symmetry).passed
         True
     """
-    if states < 1 or steps < 1:
-        raise ValueError(f"expected at least one state and one step, got states={states}, steps={steps}")
+    check_symmetry(symmetry)
+    states, steps = (checks.whole(n, x, 1, MOST) for n, x in (("states", states), ("steps", steps)))
+    tolerance = checks.real("tolerance", tolerance, 0.0)
+    seed = checks.whole("seed", seed, 0, 2**32 - 1)  # what NumPy takes
+    if observe is not None:
+        checks.function("observe", observe)
     subject = subject_of(env, symmetry, observe, Pose(keyframe, carried), seed)
     if symmetry["action"].dim != len(subject.low):
         raise ValueError(
             f"'action': the environment takes {len(subject.low)} entries, its representation has "
-            f"{symmetry['action'].dim}"
+            f"{symmetry['action'].dim}; list every actuator in order"
         )
     generator = torch.Generator().manual_seed(seed)
     check = _Check(subject, tolerance, steps, states, generator)

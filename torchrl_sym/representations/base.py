@@ -9,13 +9,13 @@ is a direct sum of small ones, written in the order of its entries:
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations.blocks import (
     Block,
     SignedPermutation,
@@ -24,6 +24,7 @@ from torchrl_sym.representations.blocks import (
 )
 
 _TOLERANCE = 1e-9
+MAX_DIM = 1_000_000  # far above any observation; more is a slip that would fill the memory
 
 
 class Representation(nn.Module):
@@ -40,6 +41,7 @@ class Representation(nn.Module):
     Raises:
         ValueError: wrong shape, a matrix that is not orthogonal, or a product that does not match the
             group's table; the message names the elements at fault.
+        TypeError: no group, or no numbers.
 
     Example:
         >>> import torch
@@ -53,8 +55,8 @@ class Representation(nn.Module):
     """
 
     def __init__(self, group: PointGroup, matrices: Tensor) -> None:
-        matrices = torch.as_tensor(matrices, dtype=torch.float64)
-        n = group.order
+        n = check_group(group).order
+        matrices = checks.array("matrices", matrices, finite=False)
         if matrices.ndim != 3 or matrices.shape[0] != n or matrices.shape[1] != matrices.shape[2]:
             raise ValueError(
                 f"expected one square matrix per element, ({n}, d, d), got {tuple(matrices.shape)}"
@@ -131,6 +133,8 @@ class Representation(nn.Module):
         return torch.cat([act(b, p) for b, p in zip(self.blocks, parts, strict=True)], dim=-1)
 
     def _check_size(self, x: Tensor) -> None:
+        if not isinstance(x, Tensor):
+            raise TypeError(f"expected a tensor, got {checks.shown(x)}; use torch.as_tensor")
         if x.ndim == 0 or x.shape[-1] != self.dim:
             raise ValueError(
                 f"expected a last dimension of {self.dim}, got a tensor of shape {tuple(x.shape)}; "
@@ -167,9 +171,8 @@ class Representation(nn.Module):
         return Representation.from_blocks(self.group, blocks, check=False)
 
     def __mul__(self, times: int) -> Representation:
-        if not hasattr(times, "__index__") or times < 1:
-            raise ValueError(f"expected a positive number of repetitions, got {times!r}")
-        blocks = [*self.blocks] * operator.index(times)
+        times = checks.whole("number of repetitions", times, 1, MAX_DIM // max(self.dim, 1))
+        blocks = self.blocks * times
         return Representation.from_blocks(self.group, blocks, check=False)
 
     __rmul__ = __mul__
@@ -197,6 +200,7 @@ class Representation(nn.Module):
         Raises:
             ValueError: ``subgroup`` has an element that the group lacks.
         """
+        check_group(subgroup)
         distance = (subgroup.matrices[:, None] - self.group.matrices).abs().amax(dim=(-2, -1))
         residual, elements = distance.min(dim=1)
         if (residual > _TOLERANCE).any():

@@ -14,7 +14,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations.base import Representation
 from torchrl_sym.representations.vectors import _horizontal
 
@@ -46,8 +47,7 @@ def rotation_6d(
         layout: whether the six entries are two columns or two rows.
     """
     _check_action(group, action, "rotation_6d")
-    if layout not in ("columns", "rows"):
-        raise ValueError(f"expected layout 'columns' or 'rows', got {layout!r}")
+    checks.one_of("layout", layout, ("columns", "rows"))
     two, full = _eye(group, 2), group.matrices
     if layout == "columns":  # column k of R X R^T is sum_j R_kj R x_j
         pair = _horizontal(group) if action == "conjugate" else two
@@ -80,6 +80,7 @@ def quaternion(group: PointGroup, action: Action = "left", *, scalar_last: bool 
         True
     """
     _check_action(group, action, "quaternion")
+    checks.flag("scalar_last", scalar_last)
     proper = group.det[:, None, None] * group.matrices
     turns = [_to_quaternion(m) for m in proper]
     left = torch.stack([_left_product(q) for q in turns])
@@ -109,8 +110,8 @@ def _lift(group: PointGroup, left: Tensor) -> Tensor:
 
 
 def _check_action(group: PointGroup, action: str, builder: str) -> None:
-    if action not in ("left", "conjugate"):
-        raise ValueError(f"expected action 'left' or 'conjugate', got {action!r}")
+    check_group(group)
+    checks.one_of("action", action, ("left", "conjugate"))
     if action == "left" and (group.det < 0).any():
         name = group.names[int(group.det.argmin())]
         raise ValueError(

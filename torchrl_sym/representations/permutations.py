@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sym.groups import PointGroup
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations.base import Representation
 from torchrl_sym.representations.blocks import SignedPermutation
 from torchrl_sym.representations.vectors import _horizontal
@@ -41,11 +42,10 @@ def signed_permutation(
         >>> hips(torch.tensor([1.0, 2.0, 3.0]), "reflect-y")
         tensor([-2., -1.,  3.])
     """
-    names = list(names)
-    if len(set(names)) != len(names):
-        raise ValueError(f"expected distinct names, got {names}")
+    check_group(group)
+    names = checks.names("names", names)
     known = {0: (torch.arange(len(names)), torch.ones(len(names), dtype=torch.int8))}
-    given = {group.index(g): _parse(g, names, targets) for g, targets in maps.items()}
+    given = {group.index(g): _parse(g, names, targets) for g, targets in _check_maps(maps).items()}
     frontier = [0]
     while frontier:  # walk the group from the identity by the given elements
         h = frontier.pop()
@@ -72,13 +72,20 @@ def permutation(
 
     Same arguments as :func:`signed_permutation`; a minus sign in a target is an error.
     """
-    for element, targets in maps.items():
+    for element, targets in _check_maps(maps).items():
         for source, target in targets.items():
             if target.startswith("-"):
                 raise ValueError(
                     f"{element!r} sends {source!r} to {target!r}: expected no sign; use signed_permutation"
                 )
     return signed_permutation(group, names, maps)
+
+
+def _check_maps(maps: Mapping[str, Mapping[str, str]]) -> Mapping[str, Mapping[str, str]]:
+    for element, targets in checks.mapping("maps", maps, "elements to maps of names").items():
+        for source, target in checks.mapping(f"maps[{element!r}]", targets, "names to names").items():
+            checks.instance(f"maps[{element!r}][{source!r}]", target, str, "write a name, or -name")
+    return maps
 
 
 def _parse(element: str, names: list[str], targets: Mapping[str, str]) -> tuple[Tensor, Tensor]:
@@ -91,7 +98,8 @@ def _parse(element: str, names: list[str], targets: Mapping[str, str]) -> tuple[
                 raise ValueError(f"{element!r} maps the unknown entry {name!r}; there are {names}")
         if index[names.index(goal)] >= 0:
             raise ValueError(
-                f"{element!r} is not a permutation: two entries are sent to {goal!r}, one is {source!r}"
+                f"{element!r} is not a permutation: two entries are sent to {goal!r}, one is {source!r}; "
+                "send every entry to a place of its own"
             )
         index[names.index(goal)] = names.index(source)
         sign[names.index(goal)] = -1 if target.startswith("-") else 1
@@ -130,11 +138,11 @@ def points(
         >>> ring(torch.tensor([10.0, 20.0, 30.0]), "reflect-y")
         tensor([20., 10., 30.])
     """
-    positions = torch.as_tensor(positions, dtype=torch.float64)
+    check_group(group)
+    tolerance = checks.real("tolerance", tolerance, 0.0)
+    positions = checks.array("positions", positions)
     if positions.ndim != 2 or positions.shape[1] not in (2, 3) or len(positions) == 0:
         raise ValueError(f"expected positions of shape (P, 2) or (P, 3), got {tuple(positions.shape)}")
-    if not positions.isfinite().all():
-        raise ValueError("expected finite positions, got NaN or infinity")
     turns = _horizontal(group) if positions.shape[1] == 2 else group.matrices
     moved = positions @ turns.mT  # (N, P, 2|3)
     distance, landing = torch.cdist(moved, positions.expand_as(moved)).min(dim=-1)
@@ -151,7 +159,7 @@ def points(
     heights = Representation.from_blocks(group, [SignedPermutation(index, torch.ones_like(index))])
     if value is None:
         return heights
-    if value.group != group:
+    if checks.instance("value", value, Representation).group != group:
         raise ValueError(f"expected a value of the same group, got {value.group}")
     products = [torch.kron(a, b) for a, b in zip(heights.matrices, value.matrices, strict=True)]
     return Representation(group, torch.stack(products))
@@ -170,8 +178,11 @@ def height_map(
         >>> grid(torch.arange(6.0), "reflect-x")
         tensor([4., 5., 2., 3., 0., 1.])
     """
-    xs, ys = (torch.as_tensor(v, dtype=torch.float64) for v in (x, y))
-    return points(group, torch.cartesian_prod(xs, ys))
+    axes = [checks.array(name, values) for name, values in (("x", x), ("y", y))]
+    for name, lines in zip("xy", axes, strict=True):
+        if lines.ndim != 1 or len(lines) == 0:
+            raise ValueError(f"{name}: expected a list of coordinates, got shape {tuple(lines.shape)}")
+    return points(group, torch.cartesian_prod(*axes))
 
 
 def _metres(point: Tensor) -> str:

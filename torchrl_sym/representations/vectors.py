@@ -21,8 +21,9 @@ from __future__ import annotations
 
 import torch
 
-from torchrl_sym.groups import PointGroup
-from torchrl_sym.representations.base import Representation
+from torchrl_sym import checks
+from torchrl_sym.groups import PointGroup, check_group
+from torchrl_sym.representations.base import MAX_DIM, Representation
 
 
 def invariant(group: PointGroup, dim: int) -> Representation:
@@ -32,14 +33,12 @@ def invariant(group: PointGroup, dim: int) -> Representation:
         >>> invariant(PointGroup.reflection("y"), 4).dim
         4
     """
-    if dim < 1:
-        raise ValueError(f"expected a positive size, got {dim}")
-    return scalar(group) * dim
+    return scalar(group) * checks.whole("dim", dim, 1, MAX_DIM)
 
 
 def scalar(group: PointGroup) -> Representation:
     """One entry that no element changes: time left, mass, a force's magnitude."""
-    return Representation(group, torch.ones(group.order, 1, 1))
+    return Representation(group, torch.ones(check_group(group).order, 1, 1))
 
 
 def pseudoscalar(group: PointGroup) -> Representation:
@@ -48,17 +47,17 @@ def pseudoscalar(group: PointGroup) -> Representation:
     A planar task's coordinates are of this kind too: position, velocity and pole angle of a cart-pole
     all change sign under its only reflection.
     """
-    return Representation(group, group.det[:, None, None])
+    return Representation(group, check_group(group).det[:, None, None])
 
 
 def polar(group: PointGroup) -> Representation:
     """A vector that turns and reflects like a position: velocity, force, gravity, displacement."""
-    return Representation(group, group.matrices)
+    return Representation(group, check_group(group).matrices)
 
 
 def axial(group: PointGroup) -> Representation:
     """A vector with a handedness, d R: angular velocity, torque, angular momentum."""
-    return Representation(group, group.det[:, None, None] * group.matrices)
+    return Representation(group, check_group(group).det[:, None, None] * group.matrices)
 
 
 def planar(group: PointGroup) -> Representation:
@@ -77,7 +76,7 @@ def heading(group: PointGroup) -> Representation:
 
 
 def _horizontal(group: PointGroup) -> torch.Tensor:
-    moved = (group.matrices[:, 2, 2] - 1).abs() > 1e-9
+    moved = (check_group(group).matrices[:, 2, 2] - 1).abs() > 1e-9
     if moved.any():
         name = group.names[int(moved.long().argmax())]
         raise ValueError(
