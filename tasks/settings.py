@@ -134,7 +134,15 @@ _CARTPOLE = PPOConfig(
 )
 
 SETTINGS: dict[str, Setting] = {
-    "cartpole": Setting(_CARTPOLE),
+    "cartpole": Setting(
+        _CARTPOLE,
+        tuned={
+            "ppo": {"desired_kl": 0.02, "minibatches": 8},
+            "aug": {"desired_kl": 0.02, "minibatches": 8},
+            "loss": {"desired_kl": 0.02, "minibatches": 8},
+            "aug-naive": {"desired_kl": 0.02, "gamma": 0.99, "minibatches": 8},
+        },
+    ),
     "anymal_push": Setting(_PUSH, _FAST, then=(Stage(_PUSH_ON, _FAST),)),
     "anymal_climb": Setting(
         _CLIMB,
