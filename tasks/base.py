@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import abc
 import importlib.resources
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

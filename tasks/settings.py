@@ -124,8 +124,9 @@ _REPOSE_ON = dataclasses.replace(
 
 # Twice the recipe's default of simulations: two thirds of the time per step, since every call of TorchRL or
 # of the networks has a constant cost, and no worse per step (3 seeds each, with and without copies). With
-# 1024 x 16 it is another seventh faster, but plain PPO learned less. What `python benchmarks/tune.py` chose
-# for each family of methods, out of the same candidates and with as many runs each (results/tuning), is below.
+# 1024 x 16 it is another seventh faster, but plain PPO learned less. `tuned` below is what
+# `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as many
+# runs each (results/tuning).
 _CARTPOLE = PPOConfig(
     iterations=202,  # 3.3 M steps
     num_envs=512,

@@ -129,7 +129,7 @@ def test_metrics_of_an_environment_are_numbers():
 def test_arguments_of_other_types_are_refused(argument):
     arguments = [TINY, MAKE_ENV, SYMMETRY]
     arguments[argument] = "cartpole"
-    with pytest.raises(TypeError, match="expected a PPOConfig, a function that makes"):
+    with pytest.raises(TypeError, match=r"expected (PPOConfig|a function|Symmetry), got"):
         train(*arguments)
 
 

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import numbers
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-import numpy as np
 import torch
 
-Range = tuple[Callable[[float], bool], str]
-"""Whether a number is accepted, and what to say that is."""
+from torchrl_sym.checks import flag, one_of, real, sequence, whole
 
 
 @dataclass(frozen=True)
@@ -21,7 +17,8 @@ class PPOConfig:
     """What to train with; every default is a value that quadruped and cart-pole PPO is run with.
 
     Raises:
-        ValueError: a value of another type or outside its range; the message names the field.
+        TypeError: a value of another type; the message names the field.
+        ValueError: one outside its range.
     """
 
     augmentation: Literal["none", "all", "random", "naive"] = "all"
@@ -162,69 +159,50 @@ _CHOICES = {
     "augmentation": ("none", "all", "random", "naive"),
     "adapt_every": ("minibatch", "iteration"),
 }
-_POSITIVE: Range = (lambda x: 0 < x < math.inf, "a positive number")
-_NOT_NEGATIVE: Range = (lambda x: 0 <= x < math.inf, "a number >= 0")
-_SHARE: Range = (lambda x: 0 <= x <= 1, "a number in [0, 1]")
-_RANGES: dict[str, Range] = {
-    "gamma": _SHARE,
-    "lmbda": _SHARE,
-    "mirror_coeff": _NOT_NEGATIVE,
-    "critic_coeff": _NOT_NEGATIVE,
-    "entropy_coeff": _NOT_NEGATIVE,
-    "clip_epsilon": (lambda x: 0 < x < 1, "a number between 0 and 1"),
-    "max_grad_norm": (lambda x: x > 0, "a positive number, inf for no clipping"),
-    "max_std": (lambda x: x > 0, "a positive number, inf for no bound"),
-    "max_log_ratio": (lambda x: x > 0, "a positive number, inf for no bound"),
+_RANGES: dict[str, dict[str, float]] = {
+    "gamma": {"low": 0, "high": 1},
+    "lmbda": {"low": 0, "high": 1},
+    "mirror_coeff": {"low": 0},
+    "critic_coeff": {"low": 0},
+    "entropy_coeff": {"low": 0},
+    "clip_epsilon": {"above": 0, "high": math.nextafter(1, 0)},
 }
 """Which numbers a field takes, where it is not any positive one."""
+
+_MAY_BE_INFINITE = {"max_grad_norm", "max_std", "max_log_ratio"}
 
 
 def _checked(name: str, kind: str, value: Any) -> Any:
     """A field's value as a plain Python object, which a checkpoint can hold; NumPy's numbers are converted.
 
     Raises:
-        ValueError: not of the field's type, or out of its range.
+        TypeError: not of the field's type.
+        ValueError: out of its range.
     """
     if name in _CHOICES:
-        return _expect(value in _CHOICES[name], name, f"one of {_CHOICES[name]}", value)
+        return one_of(name, value, _CHOICES[name])
+    if name == "device":
+        return _device(value)
     if kind == "bool":
-        return bool(_expect(isinstance(value, bool | np.bool_), name, "True or False", value))
-    if kind == "str":
-        return _device(name, value)
+        return flag(name, value)
     if value is None and kind.endswith("None"):
         return None
-    if kind.startswith("tuple"):
-        _expect(isinstance(value, list | tuple), name, "a tuple of numbers", value)
-        if kind.startswith("tuple[int"):
-            return tuple(_whole(name, item, 1) for item in value)
-        _expect(len(value) == 2, name, "two numbers, the first and the last", value)
-        return tuple(_number(name, item) for item in value)
-    return _whole(name, value, 0 if name == "seed" else 1) if kind == "int" else _number(name, value)
+    if kind.startswith("tuple[int"):
+        return tuple(whole(name, size, low=1) for size in sequence(name, value, "sizes"))
+    if kind.startswith("tuple[float"):
+        numbers = [real(name, each, above=0) for each in sequence(name, value, "two numbers")]
+        if len(numbers) != 2:
+            raise ValueError(f"{name}: expected two numbers, the first and the last, got {value!r}")
+        return tuple(numbers)
+    if kind == "int":
+        return whole(name, value, low=0 if name == "seed" else 1, high=2**63 - 1)
+    if name in _MAY_BE_INFINITE and isinstance(value, float) and value == math.inf:
+        return math.inf
+    return real(name, value, **_RANGES.get(name, {"above": 0}))
 
 
-def _device(name: str, value: Any) -> str:
+def _device(value: Any) -> str:
     try:
         return str(torch.device(value))
     except (RuntimeError, TypeError) as error:
-        raise ValueError(
-            f"{name}: expected a device of torch, such as cpu or cuda:0, got {value!r}"
-        ) from error
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    whole = isinstance(value, numbers.Real) and not isinstance(value, bool) and value % 1 == 0
-    _expect(whole and least <= value < 2**63, name, f"a whole number of at least {least}", value)
-    return int(value)
-
-
-def _number(name: str, value: Any) -> float:
-    accepts, what = _RANGES.get(name, _POSITIVE)
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    _expect(real and accepts(float(value)), name, what, value)
-    return float(value)
-
-
-def _expect(condition: bool, name: str, what: str, value: Any) -> Any:
-    if not condition:
-        raise ValueError(f"{name}: expected {what}, got {value!r}")
-    return value
+        raise ValueError(f"device: expected a device such as cpu or cuda:0, got {value!r}") from error

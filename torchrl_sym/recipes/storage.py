@@ -17,7 +17,7 @@ import os
 import pickle
 import zipfile
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import torch
 from torchrl.record.loggers import Logger, get_logger
@@ -156,6 +156,6 @@ def make_logger(kind: str | None, folder: str | os.PathLike | None, name: str) -
     The csv log is ``metrics.csv`` itself: TorchRL's CSVLogger writes a file per scalar and appends
     repeated rows when a run is continued.
     """
-    if kind in (None, "csv"):
+    if kind is None or kind == "csv":
         return None
-    return get_logger(kind, logger_name=str(folder or "."), experiment_name=name)
+    return get_logger(cast(Any, kind), logger_name=str(folder or "."), experiment_name=name)

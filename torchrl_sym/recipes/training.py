@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
+from torchrl_sym.checks import function, instance
 from torchrl_sym.recipes.checkpoint import (
     require_same_run,
     restore,
@@ -141,11 +142,9 @@ def train(
         >>> [metrics["frames"] for metrics in train(config, make_env, symmetry)]
         [64, 128]
     """
-    if not isinstance(config, PPOConfig) or not isinstance(symmetry, Symmetry) or not callable(make_env):
-        kinds = ", ".join(type(each).__name__ for each in (config, make_env, symmetry))
-        raise TypeError(
-            f"expected a PPOConfig, a function that makes environments and a Symmetry, got {kinds}"
-        )
+    instance("config", config, PPOConfig)
+    function("make_env", make_env)
+    instance("symmetry", symmetry, Symmetry)
     storage = None if folder is None else RunFolder(folder)
     earlier = None if start_from is None else RunFolder(start_from)
     require_logger(logger)
@@ -248,7 +247,7 @@ class _Run:
         try:
             for data in collector:
                 self.done += 1
-                metrics = {"iteration": self.done, "frames": self.done * data.numel()}
+                metrics: dict[str, float] = {"iteration": self.done, "frames": self.done * data.numel()}
                 metrics["collect_seconds"] = time.perf_counter() - began
                 _require_finite(data, learner.actor.in_keys)
 
@@ -298,9 +297,9 @@ class _Run:
 def _require_finite(data: TensorDictBase, keys: list) -> None:
     """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
     for key in [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]:
-        finite = data[key].isfinite()
-        if not bool(finite.all()):
-            bad = int((~finite.flatten(data.ndim)).any(-1).sum())
+        wrong = data[key].isfinite().logical_not()
+        if bool(wrong.any()):
+            bad = int(wrong.flatten(data.ndim).any(-1).sum())
             raise FloatingPointError(
                 f"expected finite numbers, got others in {key!r} of {bad} of {data.numel()} samples; end "
                 "episodes before the simulation diverges"
