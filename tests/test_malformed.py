@@ -117,7 +117,7 @@ nothing = Argument(
 )
 points = [[1.0, 0.5], [1.0, -0.5], [2.0, 0.0]]
 grid = torch.tensor([-0.1, 0.0, 0.1])
-blown = {"a billion": 10**9, "a huge number": 10**300, "a huge float": 1e300}
+blown = {"a billion": 10**9, "a huge number": 10**5000, "a huge float": 1e300}
 row = tensor(torch.ones(4, 3), wide=torch.ones(4, 4), scalar=torch.ones(()))
 
 SUBJECTS = [
@@ -264,9 +264,9 @@ def test_what_can_be_taken_exactly_is_taken():
 
 
 def test_large_sums_take_linear_time():
-    start = time.perf_counter()
+    start = time.process_time()
     assert r.invariant(K4, 50_000).dim == 50_000
-    assert time.perf_counter() - start < 5  # joined one by one, this took a minute
+    assert time.process_time() - start < 8  # it is 18 where they are joined one by one
 
 
 # The judge itself: each verdict can be reached.

@@ -14,9 +14,9 @@ from __future__ import annotations
 import difflib
 import functools
 import inspect
-import math
 import numbers
 import reprlib
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ParamSpec, TypeVar
 
@@ -28,17 +28,18 @@ from torch import Tensor
 T = TypeVar("T")
 P = ParamSpec("P")
 
+_PLAIN = (str, bytes, int, float, complex, list, tuple, dict, set, type, np.generic, Tensor)
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 80
+
 
 def shown(value: Any) -> str:
     """A value for a message: short ones as they are written, others by what they are."""
     if isinstance(value, Tensor | np.ndarray) and value.ndim:
         return f"{type(value).__name__} of shape {tuple(value.shape)}"
-    plain = isinstance(
-        value, str | bytes | bool | int | float | complex | list | tuple | dict | set | Tensor
-    )
-    return (
-        reprlib.repr(value) if plain or value is None or isinstance(value, type) else type(value).__name__
-    )
+    if isinstance(value, int) and value.bit_length() > 64:
+        return f"a number of {value.bit_length()} bits"
+    return _SHORT.repr(value) if value is None or isinstance(value, _PLAIN) else type(value).__name__
 
 
 def instance(name: str, value: Any, kind: type[T] | tuple[type[T], ...], remedy: str = "") -> T:
@@ -103,7 +104,7 @@ def real(
     wanted = _span("a finite number", low if above is None else above, high, above is not None)
     if number is None:
         raise TypeError(f"{name}: expected {wanted}, got {shown(value)}")
-    if not abs(number) < math.inf or not _within(number, low, above, high):
+    if not abs(number) <= sys.float_info.max or not _within(number, low, above, high):
         raise ValueError(f"{name}: expected {wanted}, got {shown(value)}")
     return float(number)
 
@@ -257,9 +258,10 @@ def _within(number: float, low: float | None, above: float | None, high: float |
 def _span(what: str, low: float | None, high: float | None, exclusive: bool = False) -> str:
     if low is None:
         return what
+    least, most = (x if isinstance(x, int | None) else f"{x:g}" for x in (low, high))
     if high is None:
-        return f"{what} above {low:g}" if exclusive else f"{what} of at least {low:g}"
-    return f"{what} above {low:g} and at most {high:g}" if exclusive else f"{what} from {low:g} to {high:g}"
+        return f"{what} above {least}" if exclusive else f"{what} of at least {least}"
+    return f"{what} above {least} and at most {most}" if exclusive else f"{what} from {least} to {most}"
 
 
 def _nearest(value: Any, choices: Iterable[str]) -> str:
