@@ -93,7 +93,7 @@ class AnymalClimb(Anymal):
         self.curriculum = checks.flag("curriculum", curriculum)
         super().__init__(**robot)
         self.averages = Averages("success", "level", "distance")
-        self._grid_x, self._grid_y = torch.cartesian_prod(*_axes()).unbind(-1)
+        self._grid_x, self._grid_y = (grid.clone() for grid in torch.cartesian_prod(*_axes()).unbind(-1))
         footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
         self._below = footprint.nonzero().squeeze(1)
 

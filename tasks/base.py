@@ -217,10 +217,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def control(self, action: Tensor, state: State) -> Tensor:
-        """Actuator controls for actions: ``(n, action_size)`` in [-1, 1] to ``(n, nu)``.
-
-        NaN must pass through, so that the simulation can report it.
-        """
+        """Actuator controls for finite actions: ``(n, action_size)``, meant for [-1, 1], to ``(n, nu)``."""
 
     def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Task variables after a step (last action, ...), by name; those not returned stay.

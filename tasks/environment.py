@@ -8,6 +8,7 @@ for bit.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -17,8 +18,12 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from tasks.base import Task, create
+from tasks.checks import action_of, check_saved, check_start, rows_of, whole_number
+from tasks.processes import Generator, by_value, from_value
 from tasks.simulation import Simulation
 from tasks.state import State
+
+MAX_SEED = 2**63 - 1
 
 
 class BatchedEnv(EnvBase):
@@ -28,9 +33,12 @@ class BatchedEnv(EnvBase):
     [-1, 1], clipped; ``"reward"``, ``"done"``, ``"terminated"``, ``"truncated"`` (n, 1). An episode
     is truncated after ``task.max_steps`` steps and terminated where the task says so.
 
-    A row whose simulation diverges, or whose action is not finite, is terminated with reward 0 and
-    counted in ``num_diverged``; its observation is that of the model's reference configuration. The
-    other rows are not affected.
+    A row whose simulation diverges, or whose action is not finite (NaN or infinite), is terminated with
+    reward 0 and counted in ``num_diverged``; its observation is that of the model's reference
+    configuration. The other rows are not affected.
+
+    Pickled or copied (``copy.deepcopy``) it continues exactly: state, generator, curriculum. In a forked
+    child its physics threads do not exist, and stepping it is an error, unless ``num_threads`` is 1.
 
     Args:
         task: the description.
@@ -44,6 +52,10 @@ class BatchedEnv(EnvBase):
         symmetry: the task's :class:`~torchrl_sym.Symmetry`.
         simulation: the physics.
         num_diverged: simulations that diverged since construction.
+
+    Raises:
+        TypeError: not a task, or a number of another type.
+        ValueError: a number out of range, or a task that contradicts itself.
 
     Example:
         >>> from tasks.base import create
@@ -61,30 +73,44 @@ class BatchedEnv(EnvBase):
         seed: int | None = None,
         device: torch.device | str | None = None,
     ) -> None:
+        if not isinstance(task, Task):
+            raise TypeError(
+                f"expected a task, got {type(task).__name__}; tasks.make_env takes a task's name"
+            )
+        if seed is not None:  # before the physics is made
+            seed = whole_number("seed", seed, 0, MAX_SEED)
         simulation = Simulation(task.model, num_envs, num_threads, max_velocity=task.max_velocity)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.task = task
         self.simulation = simulation
         self.num_diverged = 0
-        self._generator = torch.Generator()
+        self._generator = Generator()
         self._make_specs()
         self._check_task()
         self._substeps = task.substeps
         # Time adds up rounding errors; half a control step is far above them.
         self._time_limit = (task.max_steps - 0.5) * task.control_timestep
-        # The state of all rows; its positions and velocities are the simulation's own memory.
-        self._state = State(
-            simulation.qpos,
-            simulation.qvel,
-            simulation.mocap_pos,
-            simulation.mocap_quat,
-            simulation.time,
-        )
+        start = task.sample_initial_state(1, torch.Generator().manual_seed(0))
+        variables = {name: x.new_zeros(num_envs, *x.shape[1:]) for name, x in start.variables.items()}
+        self._state = self._state_with(variables)
         self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
         self._started = False
         self._restored = False
         self._stagger = False
         self.set_seed(seed if seed is not None else int(torch.randint(2**31, ())))
+
+    def _state_with(self, variables: dict[str, Tensor]) -> State:
+        """The state of all rows; its positions and velocities are the simulation's own memory."""
+        physics = self.simulation
+        parts = (physics.qpos, physics.qvel, physics.mocap_pos, physics.mocap_quat, physics.time)
+        return State(*parts, variables=variables)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_state": by_value(self._state.variables)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        super().__setstate__(state)
+        self._state = self._state_with(from_value(state["_state"]))
 
     @property
     def symmetry(self):
@@ -108,7 +134,8 @@ class BatchedEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Unbounded(torch.Size((n, task.observation_size)), **real), shape=(n,)
         )
-        self.action_spec = Bounded(-1.0, 1.0, shape=torch.Size((n, task.action_size)), **real)
+        self._action_shape = torch.Size((n, task.action_size))
+        self.action_spec = Bounded(-1.0, 1.0, shape=self._action_shape, **real)
         self.reward_spec = Unbounded(torch.Size((n, 1)), **real)
         self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
 
@@ -126,19 +153,26 @@ class BatchedEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(seed)
+            self._generator.manual_seed(whole_number("seed", seed, 0, MAX_SEED))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self._started:
+            raise RuntimeError("expected a started episode, got none; call reset() first")
         self._restored = False
         task, state, simulation = self.task, self._state, self.simulation
-        action = tensordict.get("action")
-        if action.requires_grad or not action.is_cpu:
-            action = action.detach().cpu()
+        action = action_of(tensordict, self._action_shape)
+        lost = None
+        if not math.isfinite(float(action.sum())):
+            lost = ~action.isfinite().all(dim=-1, keepdim=True)
+            action = action.masked_fill(lost, 0.0)
+        ctrl = task.control(action, state)
+        if lost is not None:
+            ctrl = ctrl.masked_fill(lost, math.nan)  # which the simulation reports
         active = tensordict.get("_step", None)  # TorchRL skips rows that are done in some rollouts
         if active is not None:
-            active = active.reshape(-1).cpu()
+            active = rows_of("_step", active, len(state))
         diverged = None
-        if simulation.step(task.control(action, state), self._substeps, active):
+        if simulation.step(ctrl, self._substeps, active):
             diverged = simulation.diverged()
             self.num_diverged += int(diverged.sum())
             action = action.masked_fill(diverged[:, None], 0.0)
@@ -175,7 +209,7 @@ class BatchedEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = torch.ones_like(self._over) if mask is None else mask.reshape(-1).cpu()
+        rows = torch.ones_like(self._over) if mask is None else rows_of("_reset", mask, len(self._over))
         if self._restored and bool(rows.all()):
             rows = self._over.clone()  # continue: only episodes that had ended when saved begin anew
         self._restored = False
@@ -219,7 +253,9 @@ class BatchedEnv(EnvBase):
             What :meth:`reset` returns.
 
         Raises:
-            ValueError: a wrong number of rows, or a state that is not finite.
+            TypeError: not a state.
+            ValueError: a wrong number of rows, a state that is not finite, or other variables than the
+                task's.
 
         Example:
             >>> import tasks, torch
@@ -229,21 +265,17 @@ class BatchedEnv(EnvBase):
             >>> bool((left["observation"] == -env.reset_to(start)["observation"]).all())
             True
         """
-        if len(state) != self.batch_size[0]:
-            raise ValueError(
-                f"expected a state of {self.batch_size[0]} rows, one per simulation, got {len(state)}"
-            )
+        self._write(torch.arange(*self.batch_size), state)
         self._restored = False
-        self._write(torch.arange(len(state)), state)
         return self._first_output()
 
     def _write(self, ids: Tensor, start: State) -> None:
+        own = self._state.variables
+        check_start(start, own, len(ids))
         self.simulation.write(ids, start.qpos, start.qvel, start.mocap_pos, start.mocap_quat, start.time)
-        if not self._started:  # the first full reset says which variables the task has
-            self._state.variables = {name: x.clone() for name, x in start.variables.items()}
-            self._started = True
         for name, value in start.variables.items():
-            self._state.variables[name][ids] = value
+            own[name][ids] = value.to(own[name].dtype)
+        self._started = True
         self._over = self._over.index_fill(0, ids, False)  # not in place: outputs may share it
 
     def _first_output(self) -> TensorDict:
@@ -277,6 +309,7 @@ class BatchedEnv(EnvBase):
         can be stored with ``torch.save`` and read with ``weights_only=True``.
         """
         return {
+            "task_name": self.task.name,
             "simulation": self.simulation.save(),
             "variables": {name: x.clone() for name, x in self._state.variables.items()},
             "over": self._over.clone(),
@@ -306,14 +339,28 @@ class BatchedEnv(EnvBase):
             >>> bool((other.reset()["observation"] == last).all())
             True
         """
+        self._check_saved(saved)
+        try:
+            self._generator.set_state(saved["generator"])
+            self.task.load_state_dict(saved["task"])
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            raise ValueError(
+                f"expected the saved generator and what task {self.task.name!r} saves, got something else "
+                f"({type(error).__name__}: {error}); restore what save_state() returned"
+            ) from error
         self.simulation.load(saved["simulation"])
         self._state.variables = {name: x.clone() for name, x in saved["variables"].items()}
         self._over = saved["over"].clone()
         self._started = saved["started"]
-        self._generator.set_state(saved["generator"])
         self.num_diverged = saved["num_diverged"]
-        self.task.load_state_dict(saved["task"])
         self._restored = self._started
+
+    def _check_saved(self, saved: Any) -> None:
+        own = self.save_state()
+        if isinstance(saved, dict):  # the simulation and the task look at theirs themselves
+            own |= {key: saved[key] for key in ("simulation", "task") if isinstance(saved.get(key), dict)}
+        check_saved(saved, own)
+        self.simulation.check(saved["simulation"])
 
 
 def make_env(

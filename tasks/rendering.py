@@ -11,6 +11,7 @@ variable ``MUJOCO_GL`` to ``egl`` (or ``osmesa``) before Python starts, as examp
 from __future__ import annotations
 
 import copy
+import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -99,7 +100,7 @@ def render(
         For each state ``(n, height, width, 3)`` uint8.
 
     Raises:
-        RuntimeError: no OpenGL.
+        RuntimeError: no OpenGL, or a forked child of a process that has rendered.
         KeyError: no such camera.
         ValueError: larger than the model's frame buffer, or states of another task.
         TypeError: an argument of another type.
@@ -147,7 +148,17 @@ def _states_of(task: Task, states: Sequence[State]) -> list[State]:
     return found
 
 
+@functools.cache
+def _first_process() -> int:
+    return os.getpid()  # kept by forked children
+
+
 def _renderer(model: Any, height: int, width: int) -> Any:
+    if _first_process() != os.getpid():
+        raise RuntimeError(
+            "expected rendering in the process that rendered first, got a forked child of it, where OpenGL "
+            "would wait for ever; start processes that render by 'spawn', or before anything is rendered"
+        )
     try:
         return mj.Renderer(model, height, width)
     except ValueError:

@@ -14,11 +14,18 @@ from __future__ import annotations
 
 import math
 import time
+from typing import Any
 
 import mujoco
 import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
+
+from tasks.checks import check_saved, whole_number
+from tasks.processes import LostThreads, by_value, from_value, keep_forever, tell_of_forks
+
+# More simulations or threads are refused, before the memory or the machine gives way.
+MAX_ENVS, MAX_THREADS = 2**20, 2**10
 
 
 class Simulation:
@@ -30,6 +37,9 @@ class Simulation:
     you keep. Start episodes with :meth:`write`, not through the views: it also clears what the
     solver remembers. ``seconds`` is the time spent stepping.
 
+    Pickled or copied it continues exactly, with threads of its own. A forked child has no physics
+    threads: there, unless one thread steps them all, what would need them is an error.
+
     Args:
         model: the compiled model; shared by all simulations.
         num_envs: number of simulations n.
@@ -38,7 +48,8 @@ class Simulation:
             diverged, well before MuJoCo's own limit of 1e10.
 
     Raises:
-        ValueError: a size that is not positive.
+        TypeError: a size that is not a whole number.
+        ValueError: a size out of range.
 
     Example:
         >>> import mujoco, torch
@@ -59,15 +70,18 @@ class Simulation:
         *,
         max_velocity: float = 1000.0,
     ) -> None:
-        if num_envs < 1 or num_threads < 0 or not max_velocity > 0:
-            raise ValueError(
-                "expected num_envs >= 1, num_threads >= 0 (0 for all cores) and max_velocity > 0, "
-                f"got {num_envs}, {num_threads} and {max_velocity}"
-            )
+        num_envs = whole_number("num_envs", num_envs, 1, MAX_ENVS)
+        num_threads = whole_number("num_threads (0 for all cores)", num_threads, 0, MAX_THREADS)
+        if not max_velocity > 0:
+            raise ValueError(f"expected max_velocity > 0, got {max_velocity}")
         self.model = model
         self.num_envs = num_envs
+        self.num_threads = num_threads
         self.max_velocity = max_velocity
-        self._batch = Batch(model, num_envs, num_threads)
+        self._batch: Batch | LostThreads = Batch(model, num_envs, num_threads)
+        self._one_thread = self._batch.nthread == 1
+        self._stepping = False  # in some thread of this process
+        tell_of_forks(self)
         self._state = torch.from_numpy(self._batch.state)
         self.qpos = self._view("qpos")
         self.qvel = self._view("qvel")
@@ -81,10 +95,27 @@ class Simulation:
         self._none_diverged = torch.zeros(num_envs, dtype=torch.bool)
         self._diverged = self._none_diverged
         self._expanded: dict[str, Tensor] = {}
+        self._unexpanded: dict[str, Tensor] = {}  # the model's own values of the same fields
         self.seconds = 0.0  # spent stepping
 
     def _view(self, name: str) -> Tensor:
         return torch.from_numpy(self._batch.bind(name))
+
+    def lose_threads(self) -> None:
+        """In a forked child: from now on, using threads that do not exist here is an error."""
+        if self._stepping or not self._one_thread:
+            keep_forever(self._batch)
+            self._batch = LostThreads()
+
+    def __getstate__(self) -> dict[str, Any]:
+        made = {name: getattr(self, name) for name in ("model", "num_envs", "num_threads", "max_velocity")}
+        now = {"saved": by_value(self.save()), "diverged": self._diverged, "seconds": self.seconds}
+        return {"made": made, **now}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        Simulation.__init__(self, **state["made"])
+        self.load(from_value(state["saved"]))
+        self._diverged, self.seconds = state["diverged"], state["seconds"]
 
     def step(self, ctrl: Tensor, substeps: int = 1, ids: Tensor | None = None) -> bool:
         """Advance by ``substeps`` timesteps of the model with constant controls.
@@ -110,12 +141,17 @@ class Simulation:
         if not math.isfinite(float(ctrl.sum())):
             diverged = ~self.ctrl.isfinite().all(dim=-1)
             self.ctrl[diverged] = 0.0
+            if ids is not None:
+                diverged = diverged & torch.zeros_like(diverged).index_fill(0, _numbers(ids), True)
         start = time.perf_counter()
+        self._stepping = True
         try:
             self._batch.step(None if ids is None else ids.numpy(), nstep=substeps)
         except SimulationError as error:  # only the rows in error.ids failed
             diverged = diverged.clone()
             diverged[torch.as_tensor(error.ids, dtype=torch.int64)] = True
+        finally:
+            self._stepping = False
         self.seconds += time.perf_counter() - start
         self._diverged = diverged | self._lost() if self._any_lost() else diverged
         if self._diverged is self._none_diverged:
@@ -186,6 +222,7 @@ class Simulation:
             time: ``(k,)``, s, or None for zero.
 
         Raises:
+            TypeError: a value that is not a tensor.
             ValueError: a value that is not finite, or a wrong shape.
         """
         rows = slice(None) if ids is None else ids
@@ -199,6 +236,9 @@ class Simulation:
         }
         given = {name: value for name, value in fields.items() if value is not None}
         for name, value in given.items():
+            if not isinstance(value, Tensor):
+                kind = type(value).__name__
+                raise TypeError(f"{name}: expected a tensor, got {kind}; use torch.as_tensor")
             expected = (k, *getattr(self, name).shape[1:])
             if tuple(value.shape) != expected or not bool(value.isfinite().all()):
                 raise ValueError(
@@ -222,11 +262,16 @@ class Simulation:
         """
         if name not in self._expanded:
             self._expanded[name] = torch.from_numpy(self._batch.expand(name))
+            self._unexpanded[name] = self._expanded[name][0].clone()
         return self._expanded[name]
 
     def refresh(self, ids: Tensor | None = None) -> None:
         """Recompute the constants that MuJoCo derives from expanded fields (``mj_setConst``)."""
-        self._batch.set_const(None if ids is None else ids.numpy())
+        self._stepping = True
+        try:
+            self._batch.set_const(None if ids is None else ids.numpy())
+        finally:
+            self._stepping = False
 
     def data(self, row: int) -> mujoco.MjData:  # pyright: ignore[reportAttributeAccessIssue]
         """One simulation as an ``MjData`` of its own with all derived fields, to be rendered."""
@@ -245,17 +290,25 @@ class Simulation:
         Raises:
             ValueError: the state belongs to another model or another number of simulations.
         """
-        if saved["rows"].shape != self._state.shape:
-            raise ValueError(
-                f"expected saved rows of shape {tuple(self._state.shape)} (num_envs, state size), "
-                f"got {tuple(saved['rows'].shape)}; build the simulation with the model and the "
-                "number of simulations it was saved with"
-            )
+        self.check(saved)
         self._state.copy_(saved["rows"])
-        names = [key.removeprefix("model.") for key in saved if key.startswith("model.")]
-        for name in names:
-            self.expand(name).copy_(saved[f"model.{name}"])
-        if names:
+        fields = {key.removeprefix("model."): x for key, x in saved.items() if key != "rows"}
+        for name, value in (self._unexpanded | fields).items():
+            self.expand(name).copy_(value)
+        if self._expanded:
             self.refresh()
         self._warnings[:] = 0
         self._diverged = self._none_diverged
+
+    def check(self, saved: dict[str, Tensor]) -> None:
+        """Raise ValueError unless :meth:`load` can continue from this."""
+        own = {"rows": self._state}
+        for key in saved if isinstance(saved, dict) else ():
+            if key.startswith("model."):
+                own[key] = self.expand(key.removeprefix("model."))
+        check_saved(saved, own)
+
+
+def _numbers(ids: Tensor) -> Tensor:
+    """Rows as numbers, given as numbers or as a mask."""
+    return ids.nonzero().squeeze(-1) if ids.dtype == torch.bool else ids

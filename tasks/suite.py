@@ -18,12 +18,27 @@ import torch
 from dm_control import mujoco
 from dm_control.mujoco import wrapper
 from dm_control.rl import control
+from dm_control.rl.control import PhysicsError
 from dm_env import specs
 from torch import Tensor
 
 from tasks.base import Task, create
+from tasks.processes import Generator
 from tasks.state import State
 from torchrl_sym import checks
+
+mj: Any = engine  # its compiled modules have no type stubs
+
+
+class Physics(mujoco.Physics):
+    """dm_control's physics, which pickled or copied continues exactly."""
+
+    legacy_step = False  # an instance's own value is not pickled
+
+    def __setstate__(self, data: wrapper.MjData) -> None:
+        whole = copy.copy(data.ptr)
+        super().__setstate__(data)  # runs the solver, which forgets its warm start
+        mj.mj_copyData(data.ptr, data.model.ptr, whole)
 
 
 class OneSimulation:
@@ -38,12 +53,15 @@ class OneSimulation:
 
     def refresh(self, ids: Tensor | None = None) -> None:
         """Recompute the constants that MuJoCo derives from written fields."""
-        mj: Any = engine
         mj.mj_setConst(self._model, mj.MjData(self._model))
 
 
 class SuiteTask(control.Task):
     """A task description as a dm_control task.
+
+    A simulation that diverges raises dm_control's ``PhysicsError``, and so does an action that is not
+    finite: nothing has been stepped then, and the next episode may be reset. (One row of the batched face
+    ends instead, with reward 0.)
 
     Args:
         description: the task.
@@ -58,7 +76,7 @@ class SuiteTask(control.Task):
             seed = None if random is None else checks.whole("random", random, 0, 2**32 - 1)
             random = np.random.RandomState(seed)
         self.description = checks.instance("description", description, Task, "tasks.base.create makes one")
-        self._generator = torch.Generator().manual_seed(int(random.randint(2**31)))
+        self._generator = Generator().manual_seed(int(random.randint(2**31)))
         self._state: State | None = None
         self._fresh = True
         self._reward = 0.0
@@ -94,7 +112,7 @@ class SuiteTask(control.Task):
         if self._fresh:  # dm_control's reset ran the solver; a batched row starts without memory
             physics.data.qacc_warmstart[:] = 0.0
             self._fresh = False
-        self._action = torch.as_tensor(np.asarray(action, dtype=np.float64)).reshape(1, -1)
+        self._action = _action(action, self.description.action_size)
         ctrl = self.description.control(self._action, self._current(physics))
         physics.set_control(ctrl[0].numpy())
 
@@ -132,6 +150,20 @@ class SuiteTask(control.Task):
         return state
 
 
+def _action(action: Any, size: int) -> Tensor:
+    values = np.asarray(action)
+    if values.shape != (size,) or values.dtype.kind not in "fiu":  # reshaped or broadcast, it would pass
+        raise ValueError(
+            f"action: expected {size} real numbers of shape ({size},), got {values.dtype} of shape "
+            f"{values.shape}; see env.action_spec()"
+        )
+    if not np.isfinite(values).all():
+        raise PhysicsError(
+            f"action: expected finite numbers, got {values}; check the policy, and reset the environment"
+        )
+    return torch.as_tensor(values, dtype=torch.float64)[None]
+
+
 def _row(values: np.ndarray) -> Tensor:
     return torch.from_numpy(np.array(values, dtype=np.float64))[None]
 
@@ -158,7 +190,7 @@ def load(
     """
     description = create(name, **task_kwargs)
     # A copy: the model's fields are drawn anew for every episode of a randomised task.
-    physics = mujoco.Physics.from_model(wrapper.MjModel(copy.copy(description.model)))
+    physics = Physics.from_model(wrapper.MjModel(copy.copy(description.model)))
     return control.Environment(
         physics,
         SuiteTask(description, random),

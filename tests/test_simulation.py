@@ -114,11 +114,12 @@ def test_write_sets_mocap_and_time(model):
         (torch.full((2, 2), torch.nan), r"finite qpos of shape \(2, 2\).*4 entries that are not"),
         (torch.zeros(1, 2), r"qpos of shape \(2, 2\), got shape \(1, 2\)"),
         (torch.zeros(2, 3), r"got shape \(2, 3\)"),
+        (np.zeros((2, 2)), "qpos: expected a tensor, got ndarray"),
     ],
 )
 def test_write_refuses_what_would_poison_the_state(model, qpos, message):
     simulation = Simulation(model, 2, num_threads=1)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises((TypeError, ValueError), match=message):
         simulation.write(None, qpos, torch.zeros(2, 2))
 
 
@@ -214,6 +215,52 @@ def test_expanded_model_fields_act_per_row_and_are_saved(model):
     assert torch.equal(other.expand("body_mass"), mass)
 
 
+def test_fields_that_were_not_expanded_when_saved_return_to_the_models(model):
+    simulation, other = (Simulation(model, 2, num_threads=1) for _ in range(2))
+    run(simulation, controls(5, 2))
+    other.expand("body_mass")[:, 2] = 5.0
+    other.refresh()
+    other.load(simulation.save())
+    ctrl = controls(5, 2, seed=1)
+    assert torch.equal(run(other, ctrl), run(simulation, ctrl))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda saved: saved.pop("rows"), r"expected saved with \['model.body_mass', 'rows'\], got "),
+        (lambda saved: saved.update(rows=None), "expected saved rows to be a Tensor, got NoneType"),
+        (lambda saved: saved.update(rows=saved["rows"].float()), "torch.float64, got .* and torch.float32"),
+        (lambda saved: saved["rows"].fill_(torch.nan), "expected finite saved rows"),
+        (lambda saved: saved.update({"model.body_mass": torch.ones(4)}), r"body_mass of shape \(2, 4\)"),
+        (lambda saved: saved.update({"model.nothing": torch.ones(1)}), "nothing is not an expandable"),
+        (lambda saved: saved.update(columns=torch.ones(1)), r"got \['columns', "),
+    ],
+)  # fmt: skip
+def test_what_was_not_saved_is_not_loaded(model, change, message):
+    simulation = Simulation(model, 2, num_threads=1)
+    simulation.expand("body_mass")
+    run(simulation, controls(5, 2))
+    before, saved = simulation.save(), simulation.save()
+    change(saved)
+    with pytest.raises(ValueError, match=message):
+        simulation.load(saved)
+    assert torch.equal(simulation.save()["rows"], before["rows"])
+
+
+@pytest.mark.parametrize("ids", [torch.tensor([0, 2]), torch.tensor([True, False, True])])
+def test_a_bad_control_of_a_row_that_is_not_stepped_changes_nothing(model, ids):
+    simulation = Simulation(model, 3, num_threads=1)
+    before = run(simulation, controls(5, 3))[1]
+    ctrl = torch.zeros(3, 2)
+    ctrl[1] = torch.nan
+    assert not simulation.step(ctrl, 1, ids)
+    assert torch.equal(simulation.qpos[1], before[1:3])
+    ctrl[0] = torch.inf
+    assert simulation.step(ctrl, 1, ids)
+    assert simulation.diverged().tolist() == [True, False, False]
+
+
 def test_data_is_a_copy_with_derived_fields(model):
     simulation = Simulation(model, 2, num_threads=1)
     simulation.write(None, torch.tensor([[0.0, 0.0], [2.0, 0.0]]), torch.zeros(2, 2))
@@ -223,8 +270,32 @@ def test_data_is_a_copy_with_derived_fields(model):
     assert simulation.qpos[1, 0] == 2.0
 
 
+@pytest.mark.parametrize("name", ["num_envs", "num_threads"])
+@pytest.mark.parametrize(
+    ("value", "error"),
+    [
+        (True, TypeError),
+        (1.0, TypeError),
+        (float("nan"), TypeError),
+        ("2", TypeError),
+        (None, TypeError),
+        (-1, ValueError),
+        (2**31, ValueError),
+        (2**70, ValueError),
+    ],
+)
+def test_numbers_of_simulations_and_threads(model, name, value, error):
+    with pytest.raises(error, match=rf"{name}.*expected a whole number from \d to \d+, got {value!r}"):
+        Simulation(model, **{"num_envs": 2, name: value})
+
+
+def test_whole_numbers_of_other_libraries_are_taken(model):
+    simulation = Simulation(model, np.int64(2), torch.tensor(1))
+    assert (type(simulation.num_envs), type(simulation.num_threads)) == (int, int)
+
+
 def test_bad_arguments_say_what_is_expected(model):
-    with pytest.raises(ValueError, match="num_envs >= 1"):
+    with pytest.raises(ValueError, match="num_envs: expected a whole number from 1"):
         Simulation(model, 0)
     with pytest.raises(ValueError, match="max_velocity > 0"):
         Simulation(model, 1, max_velocity=float("nan"))

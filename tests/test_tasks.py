@@ -181,6 +181,14 @@ def nan_action(env, action):
     action[1] = torch.nan
 
 
+def infinite_action(env, action):
+    action[1, -1] = -torch.inf
+
+
+def opposite_infinities(env, action):
+    action[1, 0], action[1, -1] = torch.inf, -torch.inf  # their sum is not infinite
+
+
 def huge_velocity(env, action):
     env.simulation.qvel[1, -1] = 1e7
 
@@ -190,7 +198,9 @@ def nan_position(env, action):
 
 
 @all_tasks
-@pytest.mark.parametrize("poison", [nan_action, huge_velocity, nan_position])
+@pytest.mark.parametrize(
+    "poison", [nan_action, infinite_action, opposite_infinities, huge_velocity, nan_position]
+)
 def test_divergence_ends_one_episode_and_nothing_else(name, poison, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a log file where it runs
     env, healthy = make(name, num_envs=3), make(name, num_envs=3)
@@ -204,6 +214,7 @@ def test_divergence_ends_one_episode_and_nothing_else(name, poison, tmp_path, mo
     assert out["next", "terminated"].squeeze(-1).tolist() == [False, True, False]
     assert out["next", "reward"][1] == 0
     assert after["observation"].isfinite().all()
+    assert all(x.isfinite().all() for x in env.state.variables.values())
     for key in ("observation", "reward"):
         assert out["next", key].isfinite().all()
     others = torch.tensor([0, 2])

@@ -11,7 +11,6 @@ pose that the symmetry keeps, the equations of motion are mapped onto each other
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
@@ -214,7 +213,7 @@ class Matcher:
         self.extent = max(float(model.stat.extent), 1e-6)
         self.total_mass = max(sum(link.mass for link in links.values()), 1e-12)
         self.total_inertia = max(max(np.trace(link.inertia) for link in links.values()), 1e-12)
-        self._pair = functools.cache(self._pair_of_links)
+        self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}
 
     def _carry(self) -> MjData:
         model, data, image = self.model, self.data, mj.MjData(self.model)
@@ -269,6 +268,11 @@ class Matcher:
             return misaligned  # a slide's anchor does not matter
         offset -= (offset @ axis) * axis  # a hinge's anchor may be anywhere on its axis
         return misaligned + float(np.linalg.norm(offset)) / self.extent
+
+    def _pair(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
+        if (a, b) not in self._pairs:  # not functools.cache, which does not pickle
+            self._pairs[a, b] = self._pair_of_links(a, b)
+        return self._pairs[a, b]
 
     def _pair_of_links(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
         """Cost of mapping subtree a onto subtree b, and the best pairs of children."""
