@@ -11,6 +11,7 @@ pose that the symmetry keeps, the equations of motion are mapped onto each other
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
