@@ -40,7 +40,8 @@ from tasks.base import Task, create
 from tasks.environment import BatchedEnv
 from tasks.evaluation import evaluate
 from tasks.paired_physics import draw_paired_physics
-from tasks.rendering import draw_paths, record, render, save, sheet
+from tasks.paths import draw_paths
+from tasks.rendering import record, render, save, sheet
 from tasks.state import State
 from torchrl_sym.recipes import load_actor
 

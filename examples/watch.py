@@ -25,7 +25,8 @@ import tyro
 from torchrl.envs.utils import ExplorationType
 
 import tasks
-from tasks.rendering import overlay, record, render, save, sheet
+from tasks.paths import overlay
+from tasks.rendering import record, render, save, sheet
 from torchrl_sym.recipes import load_actor
 
 FPS = 25.0

@@ -14,6 +14,7 @@ changes in place is therefore pickled as arrays, which are copied.
 from __future__ import annotations
 
 import ctypes
+import functools
 import os
 import weakref
 from collections.abc import Mapping
@@ -69,6 +70,20 @@ os.register_at_fork(after_in_child=_tell)
 def keep_forever(pool: object) -> None:
     """Never destroy ``pool``, not even when the process ends: it would wait for its threads."""
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(pool))
+
+
+@functools.cache
+def _first_renderer() -> int:
+    return os.getpid()  # kept by forked children
+
+
+def refuse_forked_rendering() -> None:
+    """RuntimeError in a forked child of a process that has rendered: OpenGL would wait for ever there."""
+    if _first_renderer() != os.getpid():
+        raise RuntimeError(
+            "expected rendering in the process that rendered first, got a forked child of it, where OpenGL "
+            "would wait for ever; start processes that render by 'spawn', or before anything is rendered"
+        )
 
 
 def by_value(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:

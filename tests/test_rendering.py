@@ -11,7 +11,8 @@ from PIL import Image
 
 from tasks import base, rendering
 from tasks.environment import BatchedEnv
-from tasks.rendering import overlay, record, render, save, sheet
+from tasks.paths import overlay
+from tasks.rendering import record, render, save, sheet
 from tests.task_helpers import all_tasks, make
 
 IMAGE = np.full((24, 32, 3), 128, dtype=np.uint8)
