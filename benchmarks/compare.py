@@ -33,7 +33,7 @@ from comparison.options import at_least_one, different
 from comparison.pool import damaged, execute_all, report
 from comparison.records import EarlierResults
 from comparison.run import Run, task_setting
-from torchrl_sym.recipes import PPOConfig
+from torchrl_sym.recipes import PPOConfig, RunFolder
 
 HERE = Path(__file__).parent
 
@@ -147,7 +147,11 @@ def main(arguments: Arguments) -> int:
     known = [run for run in runs if earlier and run.result() is None and earlier.record(run)]
     wanted = [run for run in runs if run not in known]
     about = {"workers": arguments.workers or os.cpu_count() or 1, "threads": arguments.threads or 1}
-    failed = damaged(wanted) if arguments.collect else execute_all(wanted, about["workers"])
+    if arguments.collect:
+        failed = damaged(wanted)
+    else:
+        with RunFolder(arguments.folder / shared):  # two comparisons must not share their runs
+            failed = execute_all(wanted, about["workers"])
     report(failed)
     if not known and not any(run.result() for run in runs):
         print("no run has been finished; there is nothing to write")

@@ -24,6 +24,7 @@ from comparison.options import at_least_one, different
 from comparison.pool import execute_all, report
 from comparison.run import Run, task_setting
 from comparison.tables import markdown
+from torchrl_sym.recipes import RunFolder
 
 HERE = Path(__file__).parent
 FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
@@ -69,11 +70,12 @@ def main(arguments: Arguments) -> int:
     check(arguments)
     names = list(CANDIDATES)[: arguments.candidates]
     runs = [make_run(arguments, f, c, seed) for seed in FIRST for f in arguments.families for c in names]
-    failed = execute_all(runs, arguments.workers)
-    for f in arguments.families:
-        best = sorted(names, key=lambda c: -score(runs, f, c))[:KEPT]
-        runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
-    failed += execute_all([run for run in runs if run not in failed], arguments.workers)
+    with RunFolder(arguments.folder):  # two searches must not share their runs
+        failed = execute_all(runs, arguments.workers)
+        for f in arguments.families:
+            best = sorted(names, key=lambda c: -score(runs, f, c))[:KEPT]
+            runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
+        failed += execute_all([run for run in runs if run not in failed], arguments.workers)
     report(failed)
     study.write(arguments.output, runs, failed, {"workers": arguments.workers}, points=10)
     found = table(study.read(arguments.output))

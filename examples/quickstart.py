@@ -1,7 +1,7 @@
 """The paper's effect in a few minutes: PPO against PPO with symmetric copies, on CartPole.
 
-The pole starts flat on the right or on the left. Plain PPO often masters one side and lets the pole swing
-all the way round from the other; with symmetric copies both sides are solved alike. This script trains a
+The pole starts flat on the right or on the left. Plain PPO masters one side better than the other, at times
+by a detour from one of them; with symmetric copies both sides are solved alike. This script trains a
 few seeds of each in parallel processes, each method with the settings that were tuned for it, evaluates
 both starting sides, prints the table and draws the learning curves. Killed and started again, it continues;
 finished runs are not repeated.
@@ -141,8 +141,10 @@ def draw(
     left.set(xlabel="million steps", ylabel="training return")
     middle.set(xlabel="million steps", ylabel="mirror loss", yscale="log")
     left.legend(frameon=False, loc="lower right")
+    count = len(results) // len(METHODS)
+    first = min(seed for _, seed in results)
     for (method, seed), result in results.items():
-        x = list(METHODS).index(method) + 0.12 * (seed - (len(results) // 2 - 1) / 2)
+        x = list(METHODS).index(method) + min(0.12, 0.7 / count) * (seed - first - (count - 1) / 2)
         values = list(result.goal_means.values())
         right.plot([x, x], values, color=COLORS[method], alpha=0.5)
         right.plot([x], values[:1], ">", color=COLORS[method])
@@ -150,7 +152,6 @@ def draw(
     right.set(ylabel="evaluated return", xlim=(-0.6, 1.6))
     right.set_xticks(range(len(METHODS)), [name.replace(" + ", "\n+ ") for name in METHODS])
     right.set_title("start on the right (▸) and left (◂), per seed", fontsize=9)
-    count = len(results) // len(METHODS)
     left.set_title(f"mean and range of {count} seed{'s' * (count > 1)}", fontsize=9)
     for axes in (left, middle, right):
         axes.spines[["top", "right"]].set_visible(False)
@@ -170,16 +171,17 @@ def draw_curve(axes: Axes, method: str, runs: list[list[dict]], key: str) -> Non
 
 def summary(results: dict[tuple[str, int], Evaluation]) -> str:
     """What was seen, in words that follow from the numbers."""
-    lines = ["What you saw:"]
+    lines = [f"What you saw, in {len(results) // len(METHODS)} runs each:"]
     for method in METHODS:
         found = [result for (name, _), result in results.items() if name == method]
-        detours = sum(result.variation > DETOUR for result in found)
-        worst = min(result.mean for result in found)
-        gap = max(result.variation for result in found)
+        means, gaps = [r.mean for r in found], [r.variation for r in found]
         lines.append(
-            f"  {method}: in {detours} of {len(found)} runs one side takes the long way round; the worst\n"
-            f"    run returns {worst:.2f}, and the sides of a run differ by at most {gap:.3f}."
+            f"  {method}: mean return {np.mean(means):.2f}, the worst run {min(means):.2f};\n"
+            f"    its two sides differ by {np.mean(gaps):.3f} on average, by {max(gaps):.3f} at most"
         )
+        detours = sum(gap > DETOUR for gap in gaps)
+        if detours:
+            lines.append(f"    ({detours} of them swing the pole up by a detour from one side)")
     return "\n".join(lines)
 
 
@@ -193,10 +195,9 @@ def advice() -> str:
 
 
 def main(arguments: Arguments) -> None:
-    folder = RunFolder(arguments.folder)
     try:
-        folder.lock()  # of all runs: a second start must not take those that wait
-        folders = train_all(arguments)
+        with RunFolder(arguments.folder):  # a second start must not take the runs that wait
+            folders = train_all(arguments)
     except (BlockingIOError, ValueError) as error:
         raise SystemExit(str(error)) from error
 
@@ -210,7 +211,8 @@ def main(arguments: Arguments) -> None:
     }
     table = make_table(results, curves)
     arguments.picture.parent.mkdir(parents=True, exist_ok=True)
-    arguments.picture.with_suffix(".md").write_text(table + "\n")
+    made = f"Made by `python {' '.join(sys.argv)}`:"
+    arguments.picture.with_suffix(".md").write_text(f"{made}\n\n{table}\n\n{summary(results)}\n")
     draw(curves, results, arguments.picture)
     print(f"\n{table}\n")
     print("right, left: mean return when the pole starts on that side; variation: their difference;")

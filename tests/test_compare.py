@@ -25,6 +25,7 @@ from comparison.files import write_json
 from comparison.reruns import marks
 from comparison.run import Run
 from tasks.settings import SETTINGS
+from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -342,3 +343,10 @@ def test_augmentation_is_twenty_times_as_symmetric_and_no_worse():
     plain, copies = (claims.variations(found, method) for method in ("ppo", "aug"))
     assert plain.mean() > 20 * copies.mean()
     assert claims.returns(found, "aug").mean() >= claims.returns(found, "ppo").mean()
+
+
+def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
+    with RunFolder(tmp_path / "runs" / "custom"):
+        output = compare(tmp_path, "--methods", "ppo", *TINY, "--steps", "1", expected=1)
+    assert "expected a folder that nobody trains in" in output
+    assert not (tmp_path / "results").exists()

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import tasks
-from tasks import base, curriculum, draws, rendering, state, suite
+from tasks import base, curriculum, draws, paths, rendering, state, suite
 from tests.malformed import (
     Argument,
     array,
@@ -355,7 +355,7 @@ SUBJECTS = [
     ),
     subject(
         "overlay",
-        rendering.overlay,
+        paths.overlay,
         task=Argument(PUSH, task.wrong),
         states=Argument(
             [PUSH.sample_goal_states(1, None, [0, 1])] * 2, film.wrong | {"of another task": FILM}

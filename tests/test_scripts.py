@@ -94,11 +94,9 @@ def test_quickstart_prints_the_table_and_draws_the_picture(tmp_path):
     assert output.index("What you saw") < output.index("What to do next")
     assert "[torchrl]" not in output
     assert picture.stat().st_size > 10_000
-    first = RunFolder(tmp_path)
-    first.lock()
-    with pytest.raises(AssertionError, match="expected a folder that nobody trains in"):
+    refused = pytest.raises(AssertionError, match="expected a folder that nobody trains in")
+    with RunFolder(tmp_path), refused:
         run("examples/quickstart.py", *settings)
-    first.release()
 
 
 @pytest.mark.parametrize("suffix", ["png", "gif"])

@@ -30,6 +30,8 @@ _KEYS = {"config", "iteration", "seconds", "parts"}  # of every checkpoint, also
 class RunFolder:
     """Metrics and checkpoint of one run; nothing is created before something is written.
 
+    ``with RunFolder(folder):`` holds its lock, as for a folder with the runs of several processes.
+
     Args:
         folder: where they are.
 
@@ -73,6 +75,13 @@ class RunFolder:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
+
+    def __enter__(self) -> RunFolder:
+        self.lock()
+        return self
+
+    def __exit__(self, *reason: object) -> None:
+        self.release()
 
     def save(self, checkpoint: dict[str, Any]) -> None:
         """Replace the checkpoint; a kill or a full disk leaves the old one or the new one, whole.

@@ -198,10 +198,10 @@ class _Run:
         self.folder.table.truncate(checkpoint["iteration"])
         if checkpoint["iteration"] == 0:
             return False
-        restore(self.folder, checkpoint, self.env, self.learner.parts, self.episodes)
-        restore_random(checkpoint)
         self.done, self.seconds = checkpoint["iteration"], checkpoint["seconds"]
         if self.done < self.config.iterations:
+            restore(self.folder, checkpoint, self.env, self.learner.parts, self.episodes)
+            restore_random(checkpoint)
             warn_unless_exact(self.env)
         return True
 
