@@ -276,3 +276,15 @@ def test_killed_before_the_first_iteration(tmp_path):
     torch.rand(3)
     rows, whole = list(again), list(train(TINY, MAKE_ENV, SYMMETRY))
     assert [row["mirror_loss"] for row in rows] == [row["mirror_loss"] for row in whole]
+
+
+def longer_pole(spec):
+    """An edit of the model."""
+    spec.geom("pole").size = [0.02, 0.3, 0.0]
+
+
+def test_a_description_is_the_same_in_another_process(tmp_path):
+    from torchrl_sym.recipes.checkpoint import _plain
+
+    found = _plain({"edit": longer_pole, "partial": functools.partial(longer_pole), "span": (1, 2.0)})
+    assert "0x" not in str(found) and "longer_pole" in found["edit"] and found["span"] == [1, 2.0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import warnings
 from typing import Any
 
@@ -15,6 +16,8 @@ from torchrl_sym.recipes.environment import Resumable, describe, offered
 from torchrl_sym.recipes.metrics import Episodes
 from torchrl_sym.recipes.storage import RunFolder
 
+
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _STATE = {"episodes", "rng", "cuda_rng", "env", "transforms"}  # of a run, not of a policy alone
 
 
@@ -126,5 +129,9 @@ def _differences(stored: dict[str, Any], asked: dict[str, Any]) -> dict[str, tup
 
 
 def _plain(description: dict[str, Any]) -> dict[str, Any]:
-    """A description as it comes back from a file; what is neither number nor text, as text."""
-    return json.loads(json.dumps(description, default=repr))
+    """A description as it comes back from a file; what is neither number nor text, as text.
+
+    The text is the same in another process: a function's has no address in it.
+    """
+    text = json.dumps(description, default=lambda value: _ADDRESS.sub("", repr(value)))
+    return json.loads(text)
