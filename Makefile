@@ -15,7 +15,7 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check -c constraints
 export OMP_NUM_THREADS ?= 1
 export MPLBACKEND ?= Agg
 
-.PHONY: help quickstart films test check build clean
+.PHONY: help quickstart films test check build lock clean
 .DEFAULT_GOAL := help
 
 help:
@@ -24,6 +24,7 @@ help:
 	@echo "make test         run all tests and doctests"
 	@echo "make check        lint, formatting, types"
 	@echo "make build        wheel and sdist in dist/; the wheel is smoke-tested in a clean environment"
+	@echo "make lock         constraints-hashes.txt, from which the CI installs, after a change of constraints.txt"
 	@echo "make clean        remove .venv, caches and build products"
 
 $(INSTALLED): pyproject.toml constraints.txt
@@ -68,6 +69,9 @@ build: $(INSTALLED)
 	"$$clean/venv/bin/python" $(PIP_INSTALL) dist/*.whl; \
 	cp tests/smoke_wheel.py "$$clean"; cd "$$clean"; \
 	venv/bin/python -I smoke_wheel.py
+
+lock: $(INSTALLED)
+	$(BIN)/python .ci/lock.py
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
