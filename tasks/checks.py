@@ -1,12 +1,11 @@
 """What users hand to an environment: taken exactly as it is, or refused.
 
-Numbers, actions, masks of rows, start states, saved states. An error says what was expected, what came and
+Actions, masks of rows, start states, saved states. An error says what was expected, what came and
 what to do, before anything has changed.
 """
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,31 +14,6 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from tasks.state import State
-
-
-def whole_number(name: str, value: Any, low: int, high: int) -> int:
-    """``value`` as an int from ``low`` to ``high``.
-
-    Raises:
-        TypeError: not a whole number; ``True`` is none.
-        ValueError: out of range.
-
-    Example:
-        >>> whole_number("num_envs", 2.0, 1, 10)
-        Traceback (most recent call last):
-        ...
-        TypeError: num_envs: expected a whole number from 1 to 10, got 2.0 (float)
-    """
-    try:
-        number = None if isinstance(value, bool) else operator.index(value)
-    except TypeError:
-        number = None
-    message = f"{name}: expected a whole number from {low} to {high}, got {value!r}"
-    if number is None:
-        raise TypeError(f"{message} ({type(value).__name__})")
-    if not low <= number <= high:
-        raise ValueError(message)
-    return number
 
 
 def action_of(tensordict: TensorDictBase, shape: torch.Size) -> Tensor:

@@ -18,10 +18,11 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from tasks.base import Task, create
-from tasks.checks import action_of, check_saved, check_start, rows_of, whole_number
+from tasks.checks import action_of, check_saved, check_start, rows_of
 from tasks.processes import Generator, by_value, from_value
 from tasks.simulation import Simulation
 from tasks.state import State
+from torchrl_sym import checks
 
 MAX_SEED = 2**63 - 1
 
@@ -78,7 +79,7 @@ class BatchedEnv(EnvBase):
                 f"expected a task, got {type(task).__name__}; tasks.make_env takes a task's name"
             )
         if seed is not None:  # before the physics is made
-            seed = whole_number("seed", seed, 0, MAX_SEED)
+            seed = checks.whole("seed", seed, 0, MAX_SEED)
         simulation = Simulation(task.model, num_envs, num_threads, max_velocity=task.max_velocity)
         super().__init__(device=device, batch_size=torch.Size([num_envs]))
         self.task = task
@@ -153,7 +154,7 @@ class BatchedEnv(EnvBase):
         if seed is None:
             self._generator.seed()
         else:
-            self._generator.manual_seed(whole_number("seed", seed, 0, MAX_SEED))
+            self._generator.manual_seed(checks.whole("seed", seed, 0, MAX_SEED))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         if not self._started:

@@ -21,8 +21,9 @@ import torch
 from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
-from tasks.checks import check_saved, whole_number
+from tasks.checks import check_saved
 from tasks.processes import LostThreads, by_value, from_value, keep_forever, tell_of_forks
+from torchrl_sym import checks
 
 # More simulations or threads are refused, before the memory or the machine gives way.
 MAX_ENVS, MAX_THREADS = 2**20, 2**10
@@ -70,8 +71,8 @@ class Simulation:
         *,
         max_velocity: float = 1000.0,
     ) -> None:
-        num_envs = whole_number("num_envs", num_envs, 1, MAX_ENVS)
-        num_threads = whole_number("num_threads (0 for all cores)", num_threads, 0, MAX_THREADS)
+        num_envs = checks.whole("num_envs", num_envs, 1, MAX_ENVS)
+        num_threads = checks.whole("num_threads (0 for all cores)", num_threads, 0, MAX_THREADS)
         if not max_velocity > 0:
             raise ValueError(f"expected max_velocity > 0, got {max_velocity}")
         self.model = model

@@ -253,7 +253,9 @@ def test_verify_catches_what_breaks_the_symmetry_and_names_the_part(broken, part
 
 @pytest.mark.parametrize("kwargs", [{"phase": "D"}, {"phase": ""}, {"height": 0.04}], ids=str)
 def test_phases_and_heights_that_do_not_exist_are_refused(kwargs):
-    with pytest.raises(ValueError, match=r"expected phase 'A', 'B' or 'C' and a height of at least 0.05 m"):
+    with pytest.raises(
+        ValueError, match=r"phase: expected one of|height: expected a finite number of at least 0\.05"
+    ):
         AnymalClimb(**kwargs)
 
 

@@ -6,8 +6,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 from torchrl.modules import IndependentNormal, ProbabilisticActor
 
-from tasks.base import Task, create, uniform
+from tasks.base import Task, create
 from tasks.cartpole import CartPole
+from tasks.draws import uniform
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
 from tests.task_helpers import Falling, all_tasks, make

@@ -275,8 +275,8 @@ def test_data_is_a_copy_with_derived_fields(model):
     ("value", "error"),
     [
         (True, TypeError),
-        (1.0, TypeError),
-        (float("nan"), TypeError),
+        (1.5, ValueError),
+        (float("nan"), ValueError),
         ("2", TypeError),
         (None, TypeError),
         (-1, ValueError),
@@ -290,7 +290,7 @@ def test_numbers_of_simulations_and_threads(model, name, value, error):
 
 
 def test_whole_numbers_of_other_libraries_are_taken(model):
-    simulation = Simulation(model, np.int64(2), torch.tensor(1))
+    simulation = Simulation(model, np.int64(2), torch.tensor(1.0))
     assert (type(simulation.num_envs), type(simulation.num_threads)) == (int, int)
 
 

@@ -15,7 +15,7 @@ from tests.task_helpers import Falling, all_tasks, make
 
 @pytest.mark.parametrize(
     ("seed", "error"),
-    [(True, TypeError), (1.5, TypeError), ("2", TypeError), (-1, ValueError), (2**70, ValueError)],
+    [(True, TypeError), (1.5, ValueError), ("2", TypeError), (-1, ValueError), (2**70, ValueError)],
 )
 def test_seeds(seed, error):
     with pytest.raises(error, match=rf"seed: expected a whole number from 0 .* got {seed!r}"):
@@ -241,7 +241,7 @@ def entry(name, value):
         (entry("over", torch.zeros(3)), "torch.bool, got .*torch.float32"),
         (entry("num_diverged", 1.5), "expected saved num_diverged to be a int, got float"),
         (entry("generator", torch.zeros(5056, dtype=torch.uint8)), "expected the saved generator and"),
-        (entry("task", {"phase": "A"}), "what task 'anymal_push' saves.*KeyError: 'averages'"),
+        (entry("task", {"phase": "A"}), "what task 'anymal_push' saves.*KeyError.*'averages'"),
         (lambda saved: saved["variables"].pop("level"), r"expected saved variables with .*'level'"),
         (lambda saved: saved["variables"].update(x=torch.zeros(3)), r"saved variables with .*, got .*'x'"),
         (lambda saved: saved["variables"]["level"].fill_(torch.nan), "finite saved variables level"),

@@ -34,9 +34,9 @@ _RUN = {"seed", "checkpoint_interval", "device"}
 
 def marks(study: Study, task: str, method: str) -> str:
     """The marks of a method; empty if it would be trained alike today."""
-    if task not in OURS:
+    stored = study.about["methods"].get(task, {}).get(method)
+    if task not in OURS or not stored:
         return ""
-    stored = study.about["methods"].get(task, {}).get(method) or []
     today = [
         {"config": plain(dataclasses.asdict(stage.config)), "task": plain(stage.task)}
         for stage in configure(method, task_setting(task), 0).stages

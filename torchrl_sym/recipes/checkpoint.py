@@ -16,7 +16,6 @@ from torchrl_sym.recipes.environment import Resumable, describe, offered
 from torchrl_sym.recipes.metrics import Episodes
 from torchrl_sym.recipes.storage import RunFolder
 
-
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 _STATE = {"episodes", "rng", "cuda_rng", "env", "transforms"}  # of a run, not of a policy alone
 
