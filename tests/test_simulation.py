@@ -285,7 +285,7 @@ def test_data_is_a_copy_with_derived_fields(model):
     ],
 )
 def test_numbers_of_simulations_and_threads(model, name, value, error):
-    with pytest.raises(error, match=rf"{name}.*expected a whole number from \d to \d+, got {value!r}"):
+    with pytest.raises(error, match=rf"{name}.*expected a whole number from \d to \d+, got "):
         Simulation(model, **{"num_envs": 2, name: value})
 
 

@@ -18,7 +18,7 @@ from tests.task_helpers import Falling, all_tasks, make
     [(True, TypeError), (1.5, ValueError), ("2", TypeError), (-1, ValueError), (2**70, ValueError)],
 )
 def test_seeds(seed, error):
-    with pytest.raises(error, match=rf"seed: expected a whole number from 0 .* got {seed!r}"):
+    with pytest.raises(error, match=r"seed: expected a whole number from 0 .* got "):
         tasks.make_env("cartpole", num_envs=2, num_threads=1, seed=seed)
     with pytest.raises(error, match="seed: expected"):
         make("cartpole").set_seed(seed)
