@@ -181,7 +181,7 @@ def summary(results: dict[tuple[str, int], Evaluation]) -> str:
         )
         detours = sum(gap > DETOUR for gap in gaps)
         if detours:
-            lines.append(f"    ({detours} of them swing the pole up by a detour from one side)")
+            lines.append(f"    (by more than {DETOUR:g}, a detour from one side, in {detours} of them)")
     return "\n".join(lines)
 
 
