@@ -195,7 +195,7 @@ def _checked(name: str, kind: str, value: Any) -> Any:
             raise ValueError(f"{name}: expected two numbers, the first and the last, got {value!r}")
         return tuple(numbers)
     if kind == "int":
-        return whole(name, value, low=0 if name == "seed" else 1, high=2**63 - 1)
+        return whole(name, value, 0, 2**63 - 1) if name == "seed" else whole(name, value, 1)
     if name in _MAY_BE_INFINITE and isinstance(value, float) and value == math.inf:
         return math.inf
     return real(name, value, **_RANGES.get(name, {"above": 0}))
