@@ -144,3 +144,21 @@ def test_a_loss_that_is_not_finite_is_named(value, monkeypatch):
 def test_nothing_foreign_is_printed(capfd):
     train(TINY, MAKE_ENV, SYMMETRY).run()
     assert "torchrl" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize("steers", [True, False])
+def test_a_kl_that_is_not_finite_ends_a_run_only_if_the_rate_follows_it(steers, monkeypatch):
+    learner, data = make_learner(dataclasses.replace(TINY, desired_kl=0.01 if steers else None))
+    loss = learner.losses[0]
+
+    def spoilt(minibatch):
+        out = loss(minibatch)
+        out["mean_ratio"] = out["mean_ratio"] + math.inf
+        return out
+
+    learner.losses[0] = spoilt
+    if steers:
+        with pytest.raises(FloatingPointError, match="'kl': inf"):
+            learner.learn(data)
+    else:
+        assert learner.learn(data)["kl"] == math.inf

@@ -104,15 +104,16 @@ class Learner:
         self.optimizer.zero_grad()
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
-        if not (norm + total).isfinite():
-            losses = {key: value.item() for key, value in out.items() if key.startswith("loss_")}
+        # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
+        out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
+        steering = 0.0 if self.schedule is None else out["kl"]  # one that is only reported may be inf
+        if not (norm + total + steering).isfinite():
+            numbers = {key: v.item() for key, v in out.items() if key.startswith("loss_") or key == "kl"}
             raise FloatingPointError(
-                f"expected finite losses and gradients, got {losses} and a gradient of norm {norm.item()}; "
+                f"expected finite losses and gradients, got {numbers} and a gradient of norm {norm.item()}; "
                 "lower learning_rate or max_learning_rate, or bound the std"
             )
 
-        # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
-        out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
         if self.schedule is not None and self.config.adapt_every == "minibatch":
             self.schedule.step(out["kl"])  # for this very step, as rsl_rl does: not one step late
         self.optimizer.step()
