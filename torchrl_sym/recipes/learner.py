@@ -110,8 +110,8 @@ class Learner:
         if not (norm + total + steering).isfinite():
             numbers = {key: v.item() for key, v in out.items() if key.startswith("loss_") or key == "kl"}
             raise FloatingPointError(
-                f"expected finite losses and gradients, got {numbers} and a gradient of norm {norm.item()}; "
-                "lower learning_rate or max_learning_rate, or bound the std"
+                f"expected finite losses and gradients, got {numbers} and a gradient of norm "
+                f"{norm.item()}; lower learning_rate or max_learning_rate, or bound the std"
             )
 
         if self.schedule is not None and self.config.adapt_every == "minibatch":
