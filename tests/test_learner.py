@@ -121,7 +121,7 @@ def test_what_is_not_finite_is_named_before_it_is_learned_from(where, named, mon
 
     with pytest.raises(FloatingPointError, match=named):
         train(TINY, make_env, SYMMETRY, folder=tmp_path).run()
-    train(dataclasses.replace(TINY), make_env, SYMMETRY, folder=tmp_path).close()
+    train(TINY, make_env, SYMMETRY, folder=tmp_path).close()  # the folder was given up
 
 
 @pytest.mark.parametrize("value", [math.inf, math.nan])
