@@ -117,12 +117,15 @@ def page(study: Study, tuning: str, quickstart: str, robots: dict[str, Study]) -
         That something gains nothing is confirmed if the whole interval lies below a margin. Counts of
         seeds are compared by Fisher's exact test, 2.5 % on either side. The paper's returns are not
         comparable in size: it gives neither velocity limit nor episode length.""")
+    outdated = any(marks(study, "cartpole", method) for method in study.methods("cartpole"))
+    if outdated:
+        rule += "\n\n" + prose(WAITING)
     tuned = """Every family of methods tried the same changes of the same settings with
         the same seeds, which are not those above; the winner of a family is used for all its methods
         (`tuned` in `tasks/settings.py`). So the claims compare methods at their own best; a row of this
         table compares them at equal settings. The weight of the mirror loss was varied in addition. The
         shape of the batch was chosen before, for plain PPO and augmentation together."""
-    if any(marks(study, "cartpole", method) for method in study.methods("cartpole")):
+    if outdated:
         tuned += " " + EARLIER_SEARCH
     tuned = prose(tuned)
     naive = prose("""Naive augmentation is run with three protections: its log-ratio is clamped at 20, its
