@@ -2,9 +2,9 @@
 
 `os.fork` copies the memory of a process but none of its other threads. A thread pool in the child waits for
 ever: in its next step, and even when it is destroyed. So does any pool that another thread was stepping at
-that moment, since its lock stays locked. Whoever has a pool is therefore called in every forked child, puts
-a `LostThreads` where the pool was, which raises whatever is asked of it, and keeps the pool from being
-destroyed. Results are not concerned: the child's memory is its own.
+that moment, since its lock stays locked. In every forked child, no pool is therefore destroyed, and whoever
+has one is told, to put a `LostThreads` in its place, which raises whatever is asked of it. Results are not
+concerned: the child's memory is its own.
 
 Sent to a spawned process, an object is pickled. `torch.multiprocessing` does not pickle a tensor but moves
 it to shared memory, so that parent and child would write into each other's episodes. What an environment
@@ -51,25 +51,29 @@ class LostThreads:
         )
 
 
+_POOLS: weakref.WeakSet[Any] = weakref.WeakSet()
 _OWNERS: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-def tell_of_forks(owner: OwnsThreads) -> None:
-    """Have ``owner.lose_threads()`` called in every process that is forked from this one."""
+def prepare_for_forks(pool: object, owner: OwnsThreads) -> None:
+    """In every process forked from this one, keep a pool for ever and call ``owner.lose_threads()``.
+
+    Args:
+        pool: what its threads end with. It may outlive its owner, by a view of its memory.
+        owner: who uses it.
+    """
+    _POOLS.add(pool)
     _OWNERS.add(owner)
 
 
-def _tell() -> None:
+def _after_fork() -> None:
+    for pool in list(_POOLS):  # a reference that nothing holds, so that no tear-down takes it away
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(pool))
     for owner in list(_OWNERS):
         owner.lose_threads()
 
 
-os.register_at_fork(after_in_child=_tell)
-
-
-def keep_forever(pool: object) -> None:
-    """Never destroy ``pool``, not even when the process ends: it would wait for its threads."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(pool))
+os.register_at_fork(after_in_child=_after_fork)
 
 
 @functools.cache

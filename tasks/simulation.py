@@ -22,7 +22,7 @@ from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from tasks.checks import check_saved
-from tasks.processes import LostThreads, by_value, from_value, keep_forever, tell_of_forks
+from tasks.processes import LostThreads, by_value, from_value, prepare_for_forks
 from torchrl_sym import checks
 
 # More simulations or threads are refused, before the memory or the machine gives way.
@@ -82,7 +82,7 @@ class Simulation:
         self._batch: Batch | LostThreads = Batch(model, num_envs, num_threads)
         self._one_thread = self._batch.nthread == 1
         self._stepping = False  # in some thread of this process
-        tell_of_forks(self)
+        prepare_for_forks(self._batch.state.base, self)  # the pool, which every view keeps alive
         self._state = torch.from_numpy(self._batch.state)
         self.qpos = self._view("qpos")
         self.qvel = self._view("qvel")
@@ -105,7 +105,6 @@ class Simulation:
     def lose_threads(self) -> None:
         """In a forked child: from now on, using threads that do not exist here is an error."""
         if self._stepping or not self._one_thread:
-            keep_forever(self._batch)
             self._batch = LostThreads()
 
     def __getstate__(self) -> dict[str, Any]:
