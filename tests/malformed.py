@@ -180,38 +180,36 @@ def count(right: int, low: int = 1, **more: Any) -> Argument:
         "below": low - 1,
         "far below": -DRAW.randrange(10, 1000),
         "a fraction": right + DRAW.uniform(0.1, 0.9),
-        "NaN": math.nan,
-        "infinite": math.inf,
-        "true": True,
-        "text": str(right),
-        "None": None,
-        "a list": [right],
-        "a complex number": complex(right),
-        "a tensor": torch.tensor([right, right]),
         "an array": np.array([right, right]),
     }
-    return Argument(right, wrong | more)
+    return Argument(right, wrong | _no_numbers(right) | more)
 
 
 def number(right: float, low: float = 0.0, **more: Any) -> Argument:
     """A finite number of at least ``low``, which may be minus infinity."""
     below = {"negative": low - DRAW.uniform(0.1, 9.0)} if math.isfinite(low) else {}
     wrong = {
-        "NaN": math.nan,
         "NumPy's NaN": np.float64("nan"),
         "a tensor's NaN": torch.tensor(math.nan),
-        "infinite": math.inf,
         "minus infinite": -math.inf,
         "too many digits": 10**400,
+        "an object": object(),
+    }
+    return Argument(right, wrong | _no_numbers(right) | below | more)
+
+
+def _no_numbers(right: float) -> dict[str, Any]:
+    """What is neither a whole number nor a finite one."""
+    return {
+        "NaN": math.nan,
+        "infinite": math.inf,
         "true": True,
         "text": str(right),
         "None": None,
         "a list": [right],
         "a complex number": complex(right),
         "a tensor": torch.tensor([right, right]),
-        "an object": object(),
     }
-    return Argument(right, wrong | below | more)
 
 
 def flag(right: bool) -> Argument:

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import EnvBase
@@ -13,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.networks import make_networks
 from torchrl_sym.recipes.storage import RunFolder
-from torchrl_sym.recipes.table import read_metrics
+from torchrl_sym.recipes.table import read_last
 from torchrl_sym.symmetry import Symmetry
 
 
@@ -31,9 +32,7 @@ def load_actor(
         FileNotFoundError: nothing has been trained there.
         ValueError: the checkpoint is damaged, or its policy has other observations or actions.
     """
-    path = trained_folder(folder)
-    checkpoint = RunFolder(path).load()
-    assert checkpoint is not None
+    path, checkpoint = _trained(folder)
     config = dataclasses.replace(PPOConfig(**checkpoint["config"]), device="cpu")
     actor, _ = make_networks(config, env, symmetry)
     try:
@@ -56,8 +55,7 @@ def export_actor(folder: str | os.PathLike, target: str | os.PathLike) -> None:
     Raises:
         FileNotFoundError: nothing has been trained there.
     """
-    checkpoint = RunFolder(trained_folder(folder)).load()
-    assert checkpoint is not None
+    _, checkpoint = _trained(folder)
     parts = {"actor": checkpoint["parts"]["actor"]}
     kept = {name: checkpoint[name] for name in ("config", "iteration", "seconds")}
     RunFolder(target).save({**kept, "parts": parts})
@@ -69,10 +67,15 @@ def trained_folder(folder: str | os.PathLike) -> Path:
     Raises:
         FileNotFoundError: there is none, or nothing has been learned yet.
     """
+    return _trained(folder)[0]
+
+
+def _trained(folder: str | os.PathLike) -> tuple[Path, dict[str, Any]]:
+    """The last checkpoint of a run, and where it is."""
     for path in (Path(folder), *reversed(stage_folders(folder))):
         checkpoint = RunFolder(path).load()
         if checkpoint is not None and checkpoint["iteration"] > 0:
-            return path
+            return path, checkpoint
     raise FileNotFoundError(f"expected a checkpoint in {folder}, found none; train there first")
 
 
@@ -87,9 +90,9 @@ def read_progress(folder: str | os.PathLike) -> tuple[int, float]:
     done, latest = 0, math.nan
     for path in (Path(folder), *stage_folders(folder)):
         try:
-            rows = read_metrics(path / "metrics.csv")
+            rows, last = read_last(path / "metrics.csv")
         except (OSError, ValueError):  # not begun; or damaged, which is its training's to say
             continue
         if rows:
-            done, latest = done + len(rows), rows[-1].get("return", math.nan)
+            done, latest = done + rows, last.get("return", math.nan)
     return done, latest

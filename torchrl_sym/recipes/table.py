@@ -95,18 +95,36 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, float]]:
         ValueError: another row is damaged; the message names its line.
     """
     path = Path(path)
-    lines = path.read_text().split("\n")[:-1]  # what follows the last end of a line was cut short
-    rows: list[dict[str, float]] = []
-    columns = next(csv.reader(lines[:1]), [])
-    for number, fields in enumerate(csv.reader(lines[1:]), 2):
-        try:
-            rows.append({name: _number(field) for name, field in zip(columns, fields, strict=True)})
-        except ValueError as error:
-            raise ValueError(
-                f"expected {len(columns)} numbers in line {number} of {path}, got {fields}; restore the "
-                "table from a copy, or delete its folder to train anew"
-            ) from error
-    return rows
+    columns, lines = _lines(path)
+    return [_row(path, columns, number, line) for number, line in enumerate(lines, 2)]
+
+
+def read_last(path: str | os.PathLike) -> tuple[int, dict[str, float]]:
+    """How many rows a ``metrics.csv`` has, and the last of them: for those who look at it often.
+
+    Raises:
+        ValueError: the last row is damaged.
+    """
+    path = Path(path)
+    columns, lines = _lines(path)
+    return len(lines), _row(path, columns, len(lines) + 1, lines[-1]) if lines else {}
+
+
+def _lines(path: Path) -> tuple[list[str], list[str]]:
+    """Columns and rows of a table; what follows the last end of a line was cut short."""
+    header, *lines = path.read_text().split("\n")[:-1] or [""]
+    return next(csv.reader([header]), []), lines
+
+
+def _row(path: Path, columns: list[str], number: int, line: str) -> dict[str, float]:
+    fields = next(csv.reader([line]), [])
+    try:
+        return {name: _number(field) for name, field in zip(columns, fields, strict=True)}
+    except ValueError as error:
+        raise ValueError(
+            f"expected {len(columns)} numbers in line {number} of {path}, got {fields}; restore the "
+            "table from a copy, or delete its folder to train anew"
+        ) from error
 
 
 def _number(text: str) -> float:
