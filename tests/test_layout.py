@@ -22,13 +22,16 @@ MAX_LINES = 400
 # Reading order is dependency order. A module imports from its own layer (without cycles) and from
 # the layers above it in this list. `__init__` collects them all, so none of them imports it.
 LAYERS = (
-    "checks",
+    "checks _torchrl",
     "groups",
     "representations",
+    "normalization",
     "specs",
     "symmetry",
-    "rows",
-    "transforms mirror_loss symmetric_ppo modules normalization mujoco testing",
+    "orbits memory rows",
+    "augment transforms replay",
+    "mirror_loss",
+    "symmetric_ppo modules mujoco testing",
     "recipes",
     "__init__",
 )

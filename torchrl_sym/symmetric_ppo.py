@@ -21,12 +21,9 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, d
 from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.ppo import (
-    _broadcast_advantage_to_log_weight,
-    _check_advantage_broadcast,
-)
 
 from torchrl_sym import checks
+from torchrl_sym._torchrl import broadcast_advantage_to_log_weight, check_advantage_broadcast
 from torchrl_sym.mirror_loss import (
     batched,
     check_network,
@@ -185,8 +182,8 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
             rows.expanded, adv_shape=advantage.shape[:-1]
         )
-        advantage = _broadcast_advantage_to_log_weight(advantage, log_weight)
-        _check_advantage_broadcast(advantage, log_weight)
+        advantage = broadcast_advantage_to_log_weight(advantage, log_weight)
+        check_advantage_broadcast(advantage, log_weight)
         # with a proximal policy or a capped ratio, the surrogate is weighted by the behaviour ratio
         behaviour = log_weight if log_is_weight is None else log_weight + log_is_weight
         clipped = log_weight.clamp(*self._clip_bounds)

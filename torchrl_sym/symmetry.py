@@ -159,6 +159,20 @@ class Symmetry(nn.Module):
             raise ValueError(f"expected distinct element names, at least one, got {elements}")
         return [0, *(g for g in named if g != 0)]
 
+    def draw(self, batch: TensorDictBase, *, per_sequence: bool = False) -> Tensor:
+        """Random elements, one for each row of a batch ``[*B]``, on the device of its data.
+
+        Args:
+            batch: what will be mapped.
+            per_sequence: one for each sequence ``[*B[:-1]]`` instead, the same at all of its times: a
+                recurrent network must see one image of a history.
+        """
+        shape = check_batch(batch).batch_size
+        drawn = shape[:-1] if per_sequence else shape
+        device = next((value.device for value in batch.values(True, True)), batch.device)
+        element = torch.randint(self.group.order, drawn, device=device)
+        return element.unsqueeze(-1).expand(shape) if per_sequence else element
+
     def forward(
         self,
         tensordict: TensorDictBase,
