@@ -29,9 +29,7 @@ LAYERS = (
     "specs",
     "symmetry",
     "orbits memory rows",
-    "augment transforms replay",
-    "mirror_loss",
-    "symmetric_ppo modules mujoco testing",
+    "augment transforms replay mirror_loss symmetric_ppo modules mujoco testing",
     "recipes",
     "__init__",
 )
