@@ -24,6 +24,40 @@ def check_size(key: NestedKey, spec: TensorSpec, representation: Representation)
         )
 
 
+def check_part(
+    names: list[NestedKey],
+    specs: dict[NestedKey, TensorSpec],
+    batch_size: torch.Size,
+    representation: Representation,
+    bounded: bool,
+) -> None:
+    """Check entries of an environment that are declared together, mostly a single one.
+
+    Args:
+        names: the declared entries.
+        specs: those that the environment has.
+        batch_size: of the environment.
+        representation: theirs.
+        bounded: whether their box must be mapped onto itself, also if elements mix its entries.
+
+    Raises:
+        KeyError: one is missing.
+        ValueError: a size differs, or a box is not symmetric.
+    """
+    missing = [name for name in names if name not in specs]
+    if missing:
+        raise KeyError(f"the environment lacks {missing}, which change places with others of {names}")
+    check_events(names, [specs[name].shape[len(batch_size) :] for name in names], representation)
+    if bounded or representation.is_signed_permutation:
+        check_box(names, [specs[name] for name in names], representation)
+
+
+def counted_keys(env: EnvBase) -> set[NestedKey]:
+    """What TorchRL's own counters write into the observations of an environment, the same for all copies."""
+    counters = (transform for transform in transforms_of(env) if isinstance(transform, _COUNTERS))
+    return {unravel_key(key) for transform in counters for key in transform.out_keys}
+
+
 def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
     """ValueError unless every element maps the box of a bounded spec onto itself."""
     if not isinstance(spec, Bounded) or not isinstance(spec.space, ContinuousBox):
