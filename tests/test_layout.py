@@ -25,11 +25,11 @@ LAYERS = (
     "checks _torchrl",
     "groups",
     "representations",
-    "normalization",
+    "environments",
     "specs",
     "symmetry",
     "orbits memory rows",
-    "augment transforms replay mirror_loss symmetric_ppo modules mujoco testing",
+    "augment transforms replay mirror_loss symmetric_ppo modules normalization mujoco testing",
     "recipes",
     "__init__",
 )
