@@ -52,7 +52,7 @@ def test_running_normaliser_of_a_declared_observation_is_refused():
 @pytest.mark.parametrize("leaf", ["loc", "scale"])
 def test_observation_named_like_a_distribution_parameter_must_be_declared(leaf):
     env = Fields(Bounded(-1, 1, (1,)), **{leaf: Unbounded((1,))})
-    with pytest.raises(KeyError, match=f"the environment has '{leaf}'"):
+    with pytest.raises(KeyError, match=rf"the environment has \['{leaf}'\]"):
         Symmetry(REFLECTION, {"action": SIGN}).check_specs(env)
     assert leaf not in Symmetry(REFLECTION, {"action": SIGN})
     Symmetry(REFLECTION, {"action": SIGN, leaf: SIGN}).check_specs(env)

@@ -16,6 +16,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from tests.networks import make_actor, make_batch, make_symmetry
 from torchrl_sym import MirrorLoss, PointGroup, SymmetricClipPPOLoss, Symmetry, SymmetryAugment
+from torchrl_sym.entries import split
 from torchrl_sym.representations import invariant, permutation, pseudoscalar
 
 GROUP = PointGroup.reflection("x")
@@ -81,12 +82,22 @@ def test_critic_may_read_what_the_actor_computes():
     assert torch.equal(loss(stale)["loss_critic"], loss(batch)["loss_critic"])
 
 
-def test_keys_that_copies_share_may_be_read():
-    actor = gaussian(nn.Linear(4, 2), ["observation"])
-    actor[0].in_keys = ["observation", "step_count"]
-    SYMMETRY.require(["observation", "step_count", "is_init"], "the actor")
-    with pytest.raises(KeyError, match=r"memory.*not a linear image"):
-        SYMMETRY.require(["recurrent_state_h"], "the actor")
+READ = ["mask", "index", "returns", "reward", "step_count", "_hidden", "any_log_prob", ("collector", "x")]
+
+
+@pytest.mark.parametrize("key", READ, ids=str)
+def test_what_a_network_reads_must_be_declared_whatever_its_name(key):
+    actor, critic = (
+        gaussian(nn.Linear(4, 2), ["observation", key]),
+        ValueOperator(nn.Linear(3, 1), in_keys=["observation"]),
+    )
+    with pytest.raises(KeyError, match=f"the actor reads .*{split(key)[1]}"):
+        SymmetricClipPPOLoss(actor, critic, symmetry=SYMMETRY)
+    with pytest.raises(KeyError, match="the network reads"):
+        MirrorLoss(actor, symmetry=SYMMETRY)
+    declared = Symmetry(GROUP, {"observation": SIGN * 3, "action": SIGN, key: invariant(GROUP, 1)})
+    SymmetricClipPPOLoss(actor, critic, symmetry=declared)
+    SYMMETRY.require(["observation", "is_init"], "the actor")
 
 
 def test_mirror_loss_of_one_hot_actions_compares_probabilities():

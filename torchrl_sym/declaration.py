@@ -27,7 +27,7 @@ from torchrl_sym.entries import (
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.representations import Representation
 
-# What actors write beside an action: a parameter of its distribution, or a value for each of its entries.
+# What actors write beside an action: a parameter of its distribution, or a value for each of its components.
 _SIGNED, _UNSIGNED = ("loc",), ("scale", "logits", "probs", "action_value")
 
 
@@ -83,8 +83,20 @@ class Declaration:
             names = [join(("next", *split(name)[0]), split(name)[1]) for name in names]
         return names, representation
 
-    def mapped(self, batch: TensorDictBase, chosen: Iterable[NestedKey], strict: bool) -> list[Part]:
+    def mapped(
+        self,
+        batch: TensorDictBase,
+        chosen: Iterable[NestedKey],
+        strict: bool,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
+    ) -> list[Part]:
         """What differs between the copies of a batch, each part once.
+
+        Args:
+            batch: what is mapped.
+            chosen: entries to look at.
+            strict: refuse unknown ones.
+            followers: entries that follow an action although their names do not tell.
 
         Raises:
             KeyError: unknown entries, all of them, if strict; or one without those it changes places with.
@@ -105,7 +117,7 @@ class Declaration:
                 continue
             event = value.shape[batch.batch_dims :] if isinstance(value, Tensor) else None
             try:
-                follower = self._follower(without_next(key), event)
+                follower = self._follower(key, event, (followers or {}).get(key))
             except _Unknown:
                 unknown += [key] if strict else []
                 continue
@@ -119,36 +131,39 @@ class Declaration:
             )
         return parts
 
-    def _follower(self, bare: NestedKey, event: torch.Size | None) -> Representation | None:
+    def _follower(
+        self, key: NestedKey, event: torch.Size | None, action: NestedKey | None
+    ) -> Representation | None:
         """Representation of an entry that is not declared; None if copies share it."""
-        if is_bookkeeping(bare):
+        bare = without_next(key)
+        if action is None and is_bookkeeping(bare):
             return None
         if event is None:  # no tensor: a text, an object
             raise _Unknown
         if (bare, event) not in self._followers:
-            self._followers[bare, event] = self._find_follower(bare, event)
+            self._followers[bare, event] = self._find_follower(bare, event, action)
         return self._followers[bare, event]
 
-    def _find_follower(self, bare: NestedKey, event: torch.Size) -> Representation | None:
+    def _find_follower(
+        self, bare: NestedKey, event: torch.Size, action: NestedKey | None
+    ) -> Representation | None:
         parent, leaf = split(bare)
-        actions = [
-            join(parent, leaf.removesuffix("_log_prob")),
-            join(parent, "action"),
-            *self._only_action(),
-        ]
-        action = next((self.parts[self.position[k]][1] for k in actions if k in self.position), None)
-        if leaf in (*_SIGNED, *_UNSIGNED) and join(parent, "action") in self.position:
-            assert action is not None
-            if event != torch.Size(action.event_shape):
+        beside = join(parent, "action")
+        if beside in self.position and leaf in (*_SIGNED, *_UNSIGNED):
+            representation = self.parts[self.position[beside]][1]
+            if event != torch.Size(representation.event_shape):
                 raise _Unknown
-            return action if leaf in _SIGNED else _places(bare, action, event)
-        if not is_per_row(bare):
+            return representation if leaf in _SIGNED else _places(bare, representation, event)
+
+        if action is None and not is_per_row(bare):
             raise _Unknown
         if event in (torch.Size([]), torch.Size([1])):
             return None  # one number per row
-        if action is None:
-            raise _Unknown
-        return _places(bare, action, event)
+        named = [join(parent, leaf.removesuffix("_log_prob")), beside, *self._only_action()]
+        for candidate in [action] if action is not None else named:
+            if candidate in self.position:
+                return _places(bare, self.parts[self.position[candidate]][1], event)
+        raise _Unknown
 
     def _only_action(self) -> list[NestedKey]:
         found = [key for key in self.position if split(key)[1] == "action"]
@@ -178,11 +193,11 @@ def require_even(batch: TensorDictBase) -> None:
 
 
 def _places(bare: NestedKey, action: Representation, event: torch.Size) -> Representation:
-    """How the entries of an action, or its items, change places: for one value of each.
+    """How the components of an action, or its items, change places: for one value of each.
 
     Raises:
-        _Unknown: the shape is that of no entries or items of the action.
-        KeyError: the action mixes its entries.
+        _Unknown: the shape is that of no components or items of the action.
+        KeyError: the action mixes its components.
     """
     shape = torch.Size(action.event_shape)
     items = event if event == shape[: len(event)] else event[:-1]
@@ -192,10 +207,10 @@ def _places(bare: NestedKey, action: Representation, event: torch.Size) -> Repre
         return action.leading(len(items)).unflatten(event)
     except ValueError as error:
         raise KeyError(
-            f"the batch has {bare!r} with one value for each entry of the action, {tuple(event)}, but the "
-            "action's representation mixes entries, which carries no such value to another; use a "
+            f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but the "
+            "action's representation mixes components, which carries no such value to another; use a "
             "distribution with one log-probability per action (IndependentNormal), drop the entry with "
-            "select=..., or declare it with invariant(group, d) if all its entries are equal"
+            "select=..., or declare it with invariant(group, d) if all its components are equal"
         ) from error
 
 
@@ -221,7 +236,7 @@ def check_events(names: list[NestedKey], events: list[torch.Size], representatio
         fits = (
             all(len(event) == 1 for event in events) and sum(event.numel() for event in events) == shape[0]
         )
-        wanted = f"vectors of {shape[0]} entries together"
+        wanted = f"vectors of {shape[0]} components together"
     if not fits:
         raise ValueError(
             f"entry {', '.join(map(repr, names))}: expected event dimensions {wanted}, got "

@@ -3,8 +3,8 @@
 A :class:`~torchrl_sym.Symmetry` declares what networks read and what the environment takes. The rest of a
 batch is written by TorchRL's environments, collectors, value estimators and buffers, under names of their
 own. Eq. (sym-aug) keeps log-probability, advantage and return of the original, so copies share them; but
-only where they are one number per row. With one number per entry of the action (torch's ``Normal`` gives a
-log-probability for each), or one per agent, they change places as those entries do.
+only where they are one number per row. With one number per component of the action (torch's ``Normal`` gives a
+log-probability for each), or one per agent, they change places as those components do.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tensordict.utils import unravel_key
 
 from torchrl_sym import checks
 
-# One number per row, which copies share; or one per entry or item of the action, which follow it.
+# One number per row, which copies share; or one per component or item of the action, which follow it.
 _PER_ROW = frozenset(
     [
         *("reward", "done", "terminated", "truncated", "is_init", "step_count", "episode_reward"),
@@ -81,7 +81,7 @@ class Exchanged:
 
 
 def is_per_row(bare: NestedKey) -> bool:
-    """Whether TorchRL writes numbers of a row, or of the entries of its action, under this name."""
+    """Whether TorchRL writes numbers of a row, or of the components of its action, under this name."""
     leaf = split(bare)[1]
     return leaf in _PER_ROW or leaf.endswith("log_prob") or leaf.startswith("_")
 

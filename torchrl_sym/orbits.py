@@ -8,7 +8,7 @@ identity, scattered over the batch. Padded rows of a sequence count nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -24,6 +24,7 @@ class Copies:
         symmetry: what transforms how.
         originals: the original rows, ``[B, ...]``.
         keys: what differs between copies; they share every other entry.
+        followers: entries that follow an action, by its key.
         elements: indices of the elements to apply, the identity first; None to draw one for each row.
         per_sequence: draw one for each sequence ``[B]`` of a batch ``[B, T]``.
         mask_keys: entries that say which rows count.
@@ -40,6 +41,7 @@ class Copies:
         symmetry: Symmetry,
         originals: TensorDictBase,
         keys: Iterable[NestedKey],
+        followers: Mapping[NestedKey, NestedKey],
         elements: Sequence[int] | None,
         *,
         per_sequence: bool = False,
@@ -50,11 +52,11 @@ class Copies:
         if elements is None:
             self.count = symmetry.group.order
             self.element = symmetry.draw(originals, per_sequence=per_sequence)
-            self.expanded = symmetry(originals, self.element, keys=keys)
+            self.expanded = symmetry.per_row(originals, self.element, keys=keys, followers=followers)
         else:
             self.count = len(elements)
             self.element = None
-            orbit = symmetry.orbit(originals, elements, keys=keys)
+            orbit = symmetry.orbit(originals, elements, keys=keys, followers=followers)
             self.expanded = orbit.reshape(-1, *originals.batch_size[1:])
 
     def originals(self, x):

@@ -10,18 +10,20 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
-from torchrl.envs import Compose, EnvBase, TransformedEnv, VecNorm, VecNormV2
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    InitTracker,
+    RewardSum,
+    StepCounter,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
 
+from torchrl_sym.declaration import check_events
+from torchrl_sym.environments import transforms_of
 from torchrl_sym.representations import Representation
-
-
-def check_size(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
-    """ValueError unless the last dimension of a spec is that of its representation."""
-    if not spec.shape or spec.shape[-1] != representation.dim:
-        raise ValueError(
-            f"{key!r}: the environment has shape {tuple(spec.shape)}, expected a last dimension of "
-            f"{representation.dim}"
-        )
 
 
 def check_part(
@@ -47,20 +49,46 @@ def check_part(
     missing = [name for name in names if name not in specs]
     if missing:
         raise KeyError(f"the environment lacks {missing}, which change places with others of {names}")
-    check_events(names, [specs[name].shape[len(batch_size) :] for name in names], representation)
-    if bounded or representation.is_signed_permutation:
-        check_box(names, [specs[name] for name in names], representation)
+    found = [specs[name] for name in names]
+    check_events(names, [spec.shape[len(batch_size) :] for spec in found], representation)
+    if (bounded or representation.is_signed_permutation) and any(map(_has_box, found)):
+        key = names[0] if len(names) == 1 else tuple(map(str, names))
+        check_box(key, found[0] if len(found) == 1 else _joined(found, representation), representation)
 
 
 def counted_keys(env: EnvBase) -> set[NestedKey]:
-    """What TorchRL's own counters write into the observations of an environment, the same for all copies."""
-    counters = (transform for transform in transforms_of(env) if isinstance(transform, _COUNTERS))
-    return {unravel_key(key) for transform in counters for key in transform.out_keys}
+    """What TorchRL's own counters write into an environment's observations: copies share it."""
+    written: list[NestedKey] = []
+    for transform in transforms_of(env):
+        if isinstance(transform, StepCounter):
+            written += transform.step_count_keys
+        elif isinstance(transform, InitTracker | RewardSum):
+            written += transform.out_keys
+    return {unravel_key(key) for key in written}
+
+
+def _has_box(spec: TensorSpec) -> bool:
+    return isinstance(spec, Bounded) and isinstance(spec.space, ContinuousBox)
+
+
+def _joined(specs: Sequence[TensorSpec], representation: Representation) -> Bounded:
+    """The box of entries that change places, as one."""
+    bounds = []
+    for side, unbounded in (("low", -torch.inf), ("high", torch.inf)):
+        ends = [
+            getattr(spec.space, side).double().expand(spec.shape)
+            if _has_box(spec)
+            else torch.full(spec.shape, unbounded, dtype=torch.float64)
+            for spec in specs
+        ]
+        dims = len(representation.event_shape)
+        bounds.append(torch.stack(ends, -dims) if dims > 1 else torch.cat(ends, -1))
+    return Bounded(*bounds, shape=bounds[0].shape, dtype=torch.float64)
 
 
 def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
     """ValueError unless every element maps the box of a bounded spec onto itself."""
-    if not isinstance(spec, Bounded) or not isinstance(spec.space, ContinuousBox):
+    if not _has_box(spec):
         return
     bounds = [
         bound.double().cpu().expand(spec.shape).reshape(-1, representation.dim)

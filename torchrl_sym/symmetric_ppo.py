@@ -188,6 +188,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             self.symmetry,
             td,
             self._mapped_keys(),
+            self._followers(),
             None if self.random else self.elements,
             per_sequence=self._recurrent,
             mask_keys=self._loss_mask_keys(),
@@ -249,11 +250,17 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
 
     def _mapped_keys(self) -> list[NestedKey]:
         """What may differ between symmetric copies; they share the rest of what the loss reads."""
+        networks = [*_inputs(self.actor_network), *self._critic_inputs()]
+        return self.symmetry.together([*networks, *_as_list(self.tensor_keys.action), *self._followers()])
+
+    def _followers(self) -> dict[NestedKey, NestedKey]:
+        """Numbers of a row, or of the components of its action, and that action."""
         keys = self.tensor_keys
-        networks = [*_inputs(self.actor_network), *self._critic_inputs(), *_as_list(keys.action)]
-        numbers = [*_as_list(keys.sample_log_prob), keys.advantage, keys.value_target]
-        numbers += [keys.value] if self._clips_value else []
-        return self.symmetry.together(dict.fromkeys([*networks, *numbers]))
+        actions = _as_list(keys.action)
+        numbers = [keys.advantage, keys.value_target, *([keys.value] if self._clips_value else [])]
+        probabilities = _as_list(keys.sample_log_prob)
+        each = zip(probabilities, actions, strict=False) if len(probabilities) > 1 else []
+        return dict.fromkeys([*numbers, *probabilities], actions[0]) | dict(each)
 
     def _read_keys(self) -> list[NestedKey]:
         return [*self._mapped_keys(), *self._loss_mask_keys()]

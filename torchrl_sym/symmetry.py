@@ -165,6 +165,7 @@ class Symmetry(nn.Module):
         g: int | str | Tensor,
         *,
         keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
     ) -> TensorDictBase:
         """Symmetric copy of a tensordict under one element, or one element per row.
 
@@ -172,6 +173,8 @@ class Symmetry(nn.Module):
             tensordict: any batch; it is not modified.
             g: element index or name, or indices of shape ``tensordict.batch_size``.
             keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
+            followers: entries that hold one number per row, or one for each component of an action, or for each
+                agent, by the key of that action: for names that do not tell, as ``action_log_prob`` does.
 
         Raises:
             KeyError: entries that the symmetry should know but does not (strict, or named by ``keys``).
@@ -179,10 +182,47 @@ class Symmetry(nn.Module):
                 representation's.
             TypeError: no tensordict.
         """
+        if isinstance(g, Tensor) and g.ndim:
+            return self.per_row(
+                tensordict, self._checked_rows(tensordict, g), keys=keys, followers=followers
+            )
         out = check_batch(tensordict).copy()
-        for key, image in self._images(tensordict, keys, lambda rho, x: rho(x, g)):
+        for key, image in self._images(tensordict, keys, followers, lambda rho, x: rho(x, g)):
             out.set(key, image)
         return out
+
+    def per_row(
+        self,
+        tensordict: TensorDictBase,
+        element: Tensor,
+        *,
+        keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
+    ) -> TensorDictBase:
+        """Copy of each row under its own element, of which nobody asks whether it exists.
+
+        For indices that :meth:`draw` made: to look at them would make the host wait for an accelerator.
+        """
+        out = check_batch(tensordict).copy()
+        for key, image in self._images(tensordict, keys, followers, lambda rho, x: rho.per_row(x, element)):
+            out.set(key, image)
+        return out
+
+    def _checked_rows(self, tensordict: TensorDictBase, element: Tensor) -> Tensor:
+        if element.is_floating_point() or element.dtype == torch.bool:
+            raise ValueError(f"expected indices of elements, got {element.dtype}")
+        if element.shape != check_batch(tensordict).batch_size[: element.ndim]:
+            raise ValueError(
+                f"expected an element for each row of {tuple(tensordict.batch_size)}, got indices of shape "
+                f"{tuple(element.shape)}"
+            )
+        if element.device.type == "cpu" and not torch.compiler.is_compiling() and element.numel():
+            low, high = element.aminmax()  # on an accelerator, the host would have to wait for these
+            if low < 0 or high >= self.group.order:
+                raise KeyError(
+                    f"expected element indices in [0, {self.group.order}), got {int(low)} to {int(high)}"
+                )
+        return element
 
     def orbit(
         self,
@@ -190,6 +230,7 @@ class Symmetry(nn.Module):
         elements: Sequence[int] | None = None,
         *,
         keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
     ) -> TensorDictBase:
         """All symmetric copies: batch ``[*B]`` to ``[N, *B]``, the originals first.
 
@@ -199,6 +240,8 @@ class Symmetry(nn.Module):
             tensordict: any batch; it is not modified.
             elements: indices of the elements to apply. Defaults to all of the group.
             keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
+            followers: entries that hold one number per row, or one for each component of an action, or for each
+                agent, by the key of that action: for names that do not tell, as ``action_log_prob`` does.
         """
         if elements is not None:
             elements = checks.sequence("elements", elements, of="indices")
@@ -210,7 +253,7 @@ class Symmetry(nn.Module):
             return rho.orbit(x) if elements is None else torch.stack([rho(x, g) for g in elements])
 
         out = check_batch(tensordict).expand(count, *tensordict.batch_size).copy()
-        for key, image in self._images(tensordict, keys, act):
+        for key, image in self._images(tensordict, keys, followers, act):
             out.set(key, image)
         return out
 
@@ -218,6 +261,7 @@ class Symmetry(nn.Module):
         self,
         tensordict: TensorDictBase,
         keys: Iterable[NestedKey] | None,
+        followers: Mapping[NestedKey, NestedKey] | None,
         act: Callable[[Representation, Tensor], Tensor],
     ) -> Iterator[tuple[NestedKey, Tensor]]:
         """Every entry that differs between copies, with what ``act`` makes of it."""
@@ -227,12 +271,12 @@ class Symmetry(nn.Module):
         else:
             chosen = [checks.key("keys", key) for key in checks.sequence("keys", keys, of="keys")]
         strict = self.strict or keys is not None  # what is asked for by name must be known
-        for names, representation in self._declaration.mapped(tensordict, chosen, strict):
+        for names, representation in self._declaration.mapped(tensordict, chosen, strict, followers):
             values = [tensordict.get(name) for name in names]
             if len(names) == 1:
                 yield names[0], act(representation, values[0])
                 continue
-            dims = representation.event_dims
+            dims = len(representation.event_shape)
             if dims > 1:  # one item per key
                 images = act(representation, torch.stack(values, tensordict.batch_dims)).unbind(-dims)
             else:
