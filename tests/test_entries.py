@@ -73,7 +73,7 @@ def test_numbers_of_no_entry_of_the_action_are_refused(name):
 def test_one_number_per_entry_of_an_action_that_mixes_them_is_refused():
     group = PointGroup.rotation(3)
     td = batch(action=(2,), action_log_prob=(2,), observation=(1,))
-    with pytest.raises(KeyError, match="mixes components.*IndependentNormal"):
+    with pytest.raises(KeyError, match=r"mixes components.*IndependentNormal"):
         Symmetry(group, {"observation": invariant(group, 1), "action": planar(group)})(td, 1)
 
 

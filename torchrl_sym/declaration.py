@@ -27,7 +27,7 @@ from torchrl_sym.entries import (
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.representations import Representation
 
-# What actors write beside an action: a parameter of its distribution, or a value for each of its components.
+# What actors write beside an action: a parameter of its distribution, or a value per component.
 _SIGNED, _UNSIGNED = ("loc",), ("scale", "logits", "probs", "action_value")
 
 
@@ -207,8 +207,8 @@ def _places(bare: NestedKey, action: Representation, event: torch.Size) -> Repre
         return action.leading(len(items)).unflatten(event)
     except ValueError as error:
         raise KeyError(
-            f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but the "
-            "action's representation mixes components, which carries no such value to another; use a "
+            f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
+            "the action's representation mixes components, which carries no such value to another; use a "
             "distribution with one log-probability per action (IndependentNormal), drop the entry with "
             "select=..., or declare it with invariant(group, d) if all its components are equal"
         ) from error

@@ -3,8 +3,8 @@
 A :class:`~torchrl_sym.Symmetry` declares what networks read and what the environment takes. The rest of a
 batch is written by TorchRL's environments, collectors, value estimators and buffers, under names of their
 own. Eq. (sym-aug) keeps log-probability, advantage and return of the original, so copies share them; but
-only where they are one number per row. With one number per component of the action (torch's ``Normal`` gives a
-log-probability for each), or one per agent, they change places as those components do.
+only where they are one number per row. With one number per component of the action (torch's ``Normal``
+gives a log-probability for each), or one per agent, they change places as those components do.
 """
 
 from __future__ import annotations

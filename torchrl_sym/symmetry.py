@@ -173,8 +173,8 @@ class Symmetry(nn.Module):
             tensordict: any batch; it is not modified.
             g: element index or name, or indices of shape ``tensordict.batch_size``.
             keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
-            followers: entries that hold one number per row, or one for each component of an action, or for each
-                agent, by the key of that action: for names that do not tell, as ``action_log_prob`` does.
+            followers: entries that hold one number per row, per component of an action or per agent, with
+                the key of that action: for names that do not tell, as ``action_log_prob`` does.
 
         Raises:
             KeyError: entries that the symmetry should know but does not (strict, or named by ``keys``).
@@ -240,8 +240,8 @@ class Symmetry(nn.Module):
             tensordict: any batch; it is not modified.
             elements: indices of the elements to apply. Defaults to all of the group.
             keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
-            followers: entries that hold one number per row, or one for each component of an action, or for each
-                agent, by the key of that action: for names that do not tell, as ``action_log_prob`` does.
+            followers: entries that hold one number per row, per component of an action or per agent, with
+                the key of that action: for names that do not tell, as ``action_log_prob`` does.
         """
         if elements is not None:
             elements = checks.sequence("elements", elements, of="indices")
