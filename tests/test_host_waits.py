@@ -51,7 +51,7 @@ def loss_of(**settings) -> SymmetricClipPPOLoss:
 
 @pytest.mark.parametrize("settings", SETTINGS, ids=str)
 def test_a_step_runs_where_there_are_no_numbers(settings):
-    loss = loss_of(**settings).to("meta")
+    loss = loss_of(**settings, functional=False).to("meta")
     out = loss(make_batch(12).to("meta"))
     total(out).backward()
     torch.nn.utils.clip_grad_norm_(loss.parameters(), 1.0)
@@ -72,19 +72,19 @@ def test_a_step_hands_no_number_to_the_host_and_takes_none_from_it(settings, mon
 @pytest.mark.parametrize("device", ["meta"])
 def test_losses_follow_the_device_of_networks_and_data(device):
     """Without to(device), as other losses of TorchRL."""
-    actor, critic = make_actor().to(device), make_critic().to(device)
+    actor, critic, symmetry = make_actor(), make_critic(), make_symmetry("C3")
+    settings = {"symmetry": symmetry, "functional": False}
+    losses = [SymmetricClipPPOLoss(actor, critic, elements=e, **settings) for e in ("all", "random")]
+    losses += [MirrorLoss(actor, **settings)]
+    actor.to(device), critic.to(device)
     batch = make_batch(12).to(device)
-    for elements in ("all", "random"):
-        loss = SymmetricClipPPOLoss(
-            actor, critic, symmetry=make_symmetry("C3"), elements=elements, mirror_coeff=0.1
-        )
-        assert loss(batch)["loss_objective"].device.type == device
-        batch = batch.clear_device_()
-    assert MirrorLoss(actor, symmetry=make_symmetry("C3"))(batch)["loss_mirror"].device.type == device
+    for td in (batch, batch.copy().clear_device_()):
+        for loss in losses:
+            assert all(value.device.type == device for value in loss(td).values())
 
 
 def test_the_guard_sees_what_waits():
-    for wait in (lambda x: x.item(), bool, lambda x: x.tolist()):
+    for wait in (lambda x: x.item(), bool, float):
         with pytest.raises(AssertionError, match="waits"), NoWaits():
             wait(torch.ones(1))
 

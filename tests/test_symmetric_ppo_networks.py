@@ -17,7 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 from tests.networks import make_actor, make_batch, make_symmetry
 from torchrl_sym import MirrorLoss, PointGroup, SymmetricClipPPOLoss, Symmetry, SymmetryAugment
 from torchrl_sym.entries import split
-from torchrl_sym.representations import invariant, permutation, pseudoscalar
+from torchrl_sym.representations import invariant, items, permutation, pseudoscalar
 
 GROUP = PointGroup.reflection("x")
 SIGN = pseudoscalar(GROUP)
@@ -50,13 +50,15 @@ def batch_of(*shape):
 def test_random_elements_with_agents_agree_with_one_row_per_agent(agents):
     torch.manual_seed(0)
     actor, critic = gaussian(nn.Linear(3, 2)), ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
-    loss = SymmetricClipPPOLoss(actor, critic, symmetry=SYMMETRY, elements="random", mirror_coeff=0.5)
+    places = invariant(GROUP, agents)
+    symmetry = Symmetry(GROUP, {"observation": items(places, SIGN * 3), "action": items(places, SIGN)})
+    loss = SymmetricClipPPOLoss(actor, critic, symmetry=symmetry, elements="random", mirror_coeff=0.5)
     batch = batch_of(6, agents)
     torch.manual_seed(1)
     element = torch.randint(2, (6,))
     torch.manual_seed(1)
     out = loss(batch)
-    mapped = SYMMETRY(batch.select("observation", "action"), element).update(
+    mapped = symmetry(batch.select("observation", "action"), element).update(
         batch.exclude("observation", "action")
     )
     plain = ClipPPOLoss(actor, critic)

@@ -80,12 +80,16 @@ def test_each_row_is_mapped_by_its_own_element(group, shape):
         assert_same(image[rows], symmetry(batch[rows], element), atol=1e-6)
 
 
-def test_entries_may_have_more_batch_dimensions_than_the_batch():
-    symmetry, per_agent = make_symmetry(), make_batch(6, 3)
-    batch = per_agent.auto_batch_size_(1)
+def test_items_that_stay_in_place_are_mapped_one_by_one():
+    per_agent = make_batch(6, 3)
+    batch = per_agent.copy().auto_batch_size_(1)
+    with pytest.raises(ValueError, match=r"expected event dimensions \(4,\), got \(3, 4\).*items"):
+        make_symmetry()(batch, 1)
+    group, single = GROUPS["K4"], make_symmetry()
+    agents = {key: items(invariant(group, 3), single[key]) for key in single.keys()}  # noqa: SIM118
     g = torch.arange(6) % 4
-    for image, row, element in zip(symmetry(batch, g), batch, g, strict=True):
-        assert_same(image, symmetry(row, int(element)))
+    for image, row, element in zip(Symmetry(group, agents)(batch, g), per_agent, g, strict=True):
+        assert_same(image, single(row, int(element)))
 
 
 @every_symmetric_group

@@ -19,7 +19,7 @@ from tensordict.utils import unravel_key
 from torchrl_sym import checks
 
 # One number per row, which copies share; or one per component or item of the action, which follow it.
-_PER_ROW = frozenset(
+PER_ROW = frozenset(
     [
         *("reward", "done", "terminated", "truncated", "is_init", "step_count", "episode_reward"),
         *("advantage", "value_target", "state_value", "value_error", "returns", "td_error"),
@@ -83,7 +83,7 @@ class Exchanged:
 def is_per_row(bare: NestedKey) -> bool:
     """Whether TorchRL writes numbers of a row, or of the components of its action, under this name."""
     leaf = split(bare)[1]
-    return leaf in _PER_ROW or leaf.endswith("log_prob") or leaf.startswith("_")
+    return leaf in PER_ROW or leaf.endswith("log_prob") or leaf.startswith("_")
 
 
 def is_bookkeeping(bare: NestedKey) -> bool:

@@ -332,7 +332,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             with torch.no_grad():
                 with self._using("actor_network"):
                     dist = self.actor_network.get_dist(rows.td)
-                label = act(deterministic_action(dist), rows.element)
+                label = act.per_row(deterministic_action(dist), rows.element)
             return len(self.elements) * squared_distance(output, label).unsqueeze(-1)
         output = output.unflatten(0, (len(self.elements), -1))
         with torch.no_grad():

@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase
 
 from torchrl_sym import checks
 from torchrl_sym.declaration import Declaration, require_even
+from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, split, without_next
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations import Representation
@@ -125,9 +126,11 @@ class Symmetry(nn.Module):
                 "representation if the network is equivariant"
             )
         if missing:
+            reserved = [key for key in missing if split(key)[1] in _INVARIANT]
+            hint = f" (copies share TorchRL's {reserved}, but not with a network that reads them)"
             raise KeyError(
-                f"{reader} reads {missing}, which this symmetry does not transform (it has "
-                f"{self.keys()}); add them, e.g. invariant(group, d) if no element changes them"
+                f"{reader} reads {missing}, which this symmetry does not transform (it has {self.keys()}); "
+                f"add them, e.g. invariant(group, d) if no element changes them{hint if reserved else ''}"
             )
 
     def elements(self, elements: Elements) -> list[int]:
