@@ -1,16 +1,12 @@
-"""Whether an environment's sizes, boxes and transforms fit a representation."""
+"""Whether an environment's sizes and boxes fit a representation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from tensordict import NestedKey
-from tensordict.utils import unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
-from torchrl.envs import Compose, EnvBase, TransformedEnv, VecNorm, VecNormV2
 
 from torchrl_sym.representations import Representation
 
@@ -55,19 +51,3 @@ def image_of_box(matrices: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, T
     """Bounds of the images of a box ``(d,)`` under matrices ``(..., d, d)``; 0 * inf counts as 0."""
     ends = [torch.where(matrices == 0, 0.0, matrices * bound) for bound in (low, high)]
     return torch.minimum(*ends).sum(-1), torch.maximum(*ends).sum(-1)
-
-
-def check_normalizers(env: EnvBase, keys: Sequence[NestedKey]) -> None:
-    """Refuse running normalisers of declared observations, whose statistics are not symmetric."""
-    while isinstance(env, TransformedEnv):
-        transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
-        for transform in transforms:
-            names = {unravel_key(key) for key in (*transform.in_keys, *transform.out_keys)}
-            touched = sorted(map(str, names & set(keys)))
-            if isinstance(transform, VecNorm | VecNormV2) and touched:
-                raise ValueError(
-                    f"{type(transform).__name__} normalises {touched} by running statistics, "
-                    " which are not symmetric, so that the mirrored observation is not the observation of "
-                    "the mirrored state; scale by constants, or normalise inside the networks"
-                )
-        env = env.base_env

@@ -19,8 +19,10 @@ from torchrl.envs import EnvBase
 
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup, check_group
+from torchrl_sym.probing import check_transforms
 from torchrl_sym.representations import Representation
-from torchrl_sym.specs import check_box, check_normalizers, check_size
+from torchrl_sym.specs import check_box, check_size
+from torchrl_sym.trial import Declared
 
 Elements = Literal["all", "random"] | Sequence[str]
 
@@ -281,7 +283,6 @@ class Symmetry(nn.Module):
                 not commute with, is applied to a declared observation.
         """
         checks.instance("env", env, EnvBase)
-        check_normalizers(env, self._keys)
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
             for key, spec in specs.items(include_nested=True, leaves_only=True):
                 if key in self:
@@ -294,6 +295,7 @@ class Symmetry(nn.Module):
                         f"{self._keys}); add its representation, e.g. invariant(group, d) if no element "
                         "changes it"
                     )
+        check_transforms(env, Declared(self.keys(), self, self.group.names))
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self._keys}"

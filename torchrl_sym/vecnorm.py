@@ -55,6 +55,8 @@ class SymmetricVecNorm(VecNormV2):
         tensor([0., 0., 0.])
     """
 
+    is_symmetric = True
+
     def __init__(
         self,
         in_keys: Sequence[NestedKey],
