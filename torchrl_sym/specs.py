@@ -47,7 +47,7 @@ def check_part(
 
 
 def counter_names(env: EnvBase) -> set[str]:
-    """Names under which TorchRL's own counters write into an environment's observations: copies share them."""
+    """Names under which TorchRL's own counters write observations: copies share them."""
     names: set[str] = set()
     for transform in transforms_of(env):
         if isinstance(transform, StepCounter):
