@@ -28,7 +28,7 @@ LAYERS = (
     "normalization",
     "specs",
     "symmetry",
-    "orbits memory rows",
+    "orbits memory rows networks outputs",
     "augment transforms replay mirror_loss symmetric_ppo modules mujoco testing",
     "recipes",
     "__init__",
