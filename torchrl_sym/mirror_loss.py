@@ -25,7 +25,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_sym import checks
-from torchrl_sym.networks import Effect, HeldNetwork, check_network, evaluating
+from torchrl_sym.networks import Effect, HeldNetwork, check_network, evaluating, inputs
 from torchrl_sym.outputs import compared, deterministic_action, is_q_function, output_key, own_keys
 from torchrl_sym.outputs import single_action as single_action  # where SymmetricClipPPOLoss looks for it
 from torchrl_sym.representations import Representation
@@ -181,7 +181,7 @@ class MirrorLoss(LossModule):
         self.set_keys(**own_keys(self.actor_network, symmetry, self.tensor_keys))
         if output_key(self.actor_network, self.tensor_keys):  # else it may still be named with set_keys
             self._find_output()
-        symmetry.require(self.actor_network.in_keys, "the network")
+        symmetry.require(self.in_keys, "the network")
 
     @classmethod
     def of(cls, loss: LossModule, network: str = "qvalue_network", **options: Any) -> MirrorLoss:
@@ -256,7 +256,7 @@ class MirrorLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """What the network reads."""
         if self._in_keys is None:
-            self._in_keys = list(self.actor_network.in_keys)
+            self._in_keys = inputs(self.actor_network)
         return self._in_keys
 
     @in_keys.setter
@@ -285,6 +285,7 @@ class MirrorLoss(LossModule):
         return self._compared
 
     def _output(self, tensordict: TensorDictBase) -> Tensor:
+        """What is compared, of rows ``[*B]``."""
         if hasattr(self.actor_network, "get_dist"):
             return deterministic_action(self.actor_network.get_dist(tensordict))
         key, _ = self._find_output()
@@ -303,14 +304,19 @@ class MirrorLoss(LossModule):
         if self.stop_gradient and len(orbit) > 1:
             with torch.no_grad():
                 source = self._output(orbit[0])
-            return mirror_error(self._output(orbit[1:]), source, act, elements[1:])
-        output = self._output(orbit)
+            return mirror_error(self._images(orbit[1:]), source, act, elements[1:])
+        output = self._images(orbit)
         return mirror_error(output, output[0], act, elements, stop_gradient=self.stop_gradient)
+
+    def _images(self, orbit: TensorDictBase) -> Tensor:
+        """What is compared, of ``[n, *B]``; as rows, since many networks take no further batch dimension."""
+        rows = orbit.reshape(-1, *orbit.batch_size[2:])
+        return self._output(rows).unflatten(0, orbit.batch_size[:2])
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.actor_network.in_keys, strict=False), self.in_keys[0])
+        state = batched(tensordict.select(*self.in_keys, strict=False), self.in_keys[0])
         orbit = self.symmetry.orbit(state)  # [N, *B], identity first
         with evaluating(self.actor_network):
             members = self._held.each(lambda: self._error(orbit))
