@@ -30,7 +30,7 @@ LAYERS = (
     "trial probing normalization",
     "specs",
     "symmetry",
-    "orbits memory",
+    "orbits memory networks outputs",
     "augment transforms replay mirror_loss symmetric_ppo modules vecnorm mujoco testing",
     "recipes",
     "__init__",
