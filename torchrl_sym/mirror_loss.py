@@ -23,6 +23,7 @@ from torchrl.modules import OneHotCategorical
 from torchrl.objectives import LossModule
 
 from torchrl_sym import checks
+from torchrl_sym.memory import Memory
 from torchrl_sym.representations import Representation, invariant
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 
@@ -46,6 +47,9 @@ class MirrorLoss(LossModule):
         stop_gradient: treat K_g[pi(s)] as a label. Defaults to ``True``, as in the paper.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
         per_element: also return ``mirror_error``, the unweighted error of each element, ``(N,)``.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and do not count. Defaults to 0: such
+            sequences are refused.
         functional: as in other TorchRL losses. Defaults to ``True``.
 
     Raises:
@@ -97,6 +101,7 @@ class MirrorLoss(LossModule):
         stop_gradient: bool = True,
         reduction: str | None = None,
         per_element: bool = False,
+        burn_in: int = 0,
         functional: bool = True,
     ) -> None:
         check_network("actor_network", actor_network)
@@ -120,6 +125,8 @@ class MirrorLoss(LossModule):
         self._follow_network()
         if self._is_policy():  # any other output may still be named with set_keys
             self._output_representation()
+        copies = symmetry.group.order > 1
+        self.memory = Memory.of(symmetry, [actor_network], burn_in=burn_in, copies=copies)
         symmetry.require(actor_network.in_keys, "the network")
 
     @property
@@ -195,8 +202,10 @@ class MirrorLoss(LossModule):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.actor_network.in_keys, strict=False), self.in_keys[0])
-        orbit = self.symmetry.orbit(state)  # [N, *B], identity first
+        tensordict = batched(tensordict.clone(False), self.in_keys[0])
+        tensordict = self.memory.prepare(tensordict, self._loss_mask_keys())
+        state = tensordict.select(*self.actor_network.in_keys, strict=False)
+        orbit = self.memory.rebuild(self.symmetry.orbit(state))  # [N, *B], identity first
         act = self._output_representation()
         if self.stop_gradient and len(orbit) > 1:
             with torch.no_grad():

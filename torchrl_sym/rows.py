@@ -12,6 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from torchrl_sym.memory import Memory
 from torchrl_sym.symmetry import Symmetry
 
 
@@ -31,11 +32,17 @@ class OrbitRows:
     """
 
     def __init__(
-        self, symmetry: Symmetry, elements: list[int], td: TensorDictBase, mapped_keys: list[NestedKey]
+        self,
+        symmetry: Symmetry,
+        elements: list[int],
+        td: TensorDictBase,
+        mapped_keys: list[NestedKey],
+        memory: Memory,
     ) -> None:
         self.td = td
         self.count = len(elements)
-        self.expanded = symmetry.orbit(td, elements, keys=mapped_keys).reshape(-1, *td.batch_size[1:])
+        orbit = symmetry.orbit(td, elements, keys=mapped_keys)
+        self.expanded = memory.rebuild(orbit).reshape(-1, *td.batch_size[1:])
 
     def originals(self, x):
         """Rows of the identity, of a tensor or tensordict."""
@@ -74,11 +81,13 @@ class DrawnRows:
         count: number of elements N.
     """
 
-    def __init__(self, symmetry: Symmetry, td: TensorDictBase, mapped_keys: list[NestedKey]) -> None:
+    def __init__(
+        self, symmetry: Symmetry, td: TensorDictBase, mapped_keys: list[NestedKey], memory: Memory
+    ) -> None:
         self.td = td
         self.count = symmetry.group.order
-        self.element = torch.randint(self.count, td.batch_size, device=td.device)
-        self.expanded = symmetry(td, self.element, keys=mapped_keys)
+        self.element = memory.draw(symmetry, td)
+        self.expanded = memory.rebuild(symmetry(td, self.element, keys=mapped_keys), self.element)
 
     def originals(self, x):
         """All rows, weighted so that their mean is that of the rows that drew the identity."""

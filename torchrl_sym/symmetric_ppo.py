@@ -24,6 +24,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from torchrl_sym import checks
 from torchrl_sym._torchrl import broadcast_advantage_to_log_weight, check_advantage_broadcast
+from torchrl_sym.memory import Memory
 from torchrl_sym.mirror_loss import (
     batched,
     check_network,
@@ -63,12 +64,16 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         mirror_coeff: weight w of the mirror loss (Eq. symm-loss), finite and not negative, added as
             ``loss_mirror``; it reuses the actor's pass over the orbit. 0 leaves it out. Schedulable when
             positive.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and count neither for them nor for their
+            originals. Defaults to 0: such sequences are refused.
         **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts, and nothing that it would ignore.
 
     Raises:
         KeyError: a network reads a key, or the action is one, that the symmetry does not declare; or
             there is no such element.
-        ValueError: a number that is not finite or out of range.
+        ValueError: a number that is not finite or out of range; in a call, sequences whose copies would
+            begin from a wrong memory.
         TypeError: an argument of another type, or of a name that neither loss knows.
 
     Example:
@@ -114,6 +119,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         symmetry: Symmetry,
         elements: Elements = "all",
         mirror_coeff: float = 0.0,
+        burn_in: int = 0,
         **clip_ppo_kwargs,
     ) -> None:
         check_symmetry(symmetry)
@@ -139,6 +145,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         if self._mirrors:
             self.register_coeff_buffer("mirror_coeff", mirror_coeff)
             single_action(self.actor_network)
+        networks = (self.actor_network, self.critic_network)
+        copies = len(self.elements) > 1
+        self.memory = Memory.of(self.symmetry, networks, burn_in=burn_in, copies=copies)
         self._require_keys()
 
     _schedulable_buffers = ClipPPOLoss._schedulable_buffers | {"mirror_coeff"}
@@ -171,12 +180,13 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         """Compute the losses; the input is not modified."""
         td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
         self._prepare_advantage(td)
+        td = self.memory.prepare(td, self._loss_mask_keys())
         td = td.select(*self._read_keys(), strict=False)
         mapped = self._mapped_keys()
         if self.random:
-            rows = DrawnRows(self.symmetry, td, mapped)
+            rows = DrawnRows(self.symmetry, td, mapped, self.memory)
         else:
-            rows = OrbitRows(self.symmetry, self.elements, td, mapped)
+            rows = OrbitRows(self.symmetry, self.elements, td, mapped, self.memory)
         advantage = rows.expanded.get(self.tensor_keys.advantage)
 
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
