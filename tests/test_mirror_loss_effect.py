@@ -11,9 +11,7 @@ from torchrl.objectives import SACLoss, TD3Loss
 from tests.networks import ACTION_DIM, OBSERVATION_DIM, make_actor, make_batch, make_critic, make_symmetry
 from torchrl_sym import MirrorLoss
 
-pytestmark = pytest.mark.filterwarnings(
-    "ignore:No target network", "ignore:MirrorLoss has been given"
-)
+pytestmark = pytest.mark.filterwarnings("ignore:No target network", "ignore:MirrorLoss has been given")
 REMEDY = r"no optimizer holds them.*MirrorLoss\.of\(loss, 'qvalue_network'"
 STEPS = 30
 

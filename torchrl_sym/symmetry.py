@@ -112,6 +112,15 @@ class Symmetry(nn.Module):
             raise KeyError(f"{key!r} has no representation of its own: {names} change places")
         return representation
 
+    def event_dims(self, key: NestedKey) -> int:
+        """Number of dimensions behind those of the batch, of a declared entry; 1 for any other."""
+        part = self._declaration.part(key)
+        if part is None:
+            return 1
+        names, representation = part
+        dims = len(representation.event_shape)
+        return dims - 1 if len(names) > 1 and dims > 1 else dims
+
     def require(self, keys: Iterable[NestedKey], reader: str) -> None:
         """Raise KeyError unless every key that a network reads is declared, whatever its name.
 
