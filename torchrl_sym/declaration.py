@@ -229,7 +229,10 @@ def check_events(names: list[NestedKey], events: list[torch.Size], representatio
     """ValueError unless entries have the event dimensions of their representation."""
     shape = torch.Size(representation.event_shape)
     if len(names) == 1:
-        fits, wanted = events[0] == shape, f"{tuple(shape)}"
+        # one item may lie in dimensions of its own, such as the only layer of a memory
+        more = events[0][: max(len(events[0]) - len(shape), 0)]
+        fits = events[0] == more + shape and more.numel() == 1
+        wanted = f"{tuple(shape)}"
     elif len(shape) > 1:
         fits, wanted = events == [shape[1:]] * shape[0], f"{shape[0]} of {tuple(shape[1:])}"
     else:
