@@ -107,9 +107,12 @@ class Declaration:
         done: set[NestedKey] = set()
         for key in chosen:
             value = batch.get(key, None)
+            part = self.part(key)
+            if value is None and part is None and not (is_per_row(key) or is_bookkeeping(key)):
+                unknown += [] if key in (followers or {}) else [key]  # misspelt, most likely
+                continue
             if value is None or key in done:
                 continue
-            part = self.part(key)
             if part is not None:
                 _check_events(batch, *part)
                 parts.append(part)
