@@ -309,7 +309,7 @@ class MirrorLoss(LossModule):
         return mirror_error(output, output[0], act, elements, stop_gradient=self.stop_gradient)
 
     def _images(self, orbit: TensorDictBase) -> Tensor:
-        """What is compared, of ``[n, *B]``; as rows, since many networks take no further batch dimension."""
+        """What is compared, of copies ``[n, *B]``; as rows, since many networks take no more dimensions."""
         rows = orbit.reshape(-1, *orbit.batch_size[2:])
         return self._output(rows).unflatten(0, orbit.batch_size[:2])
 
