@@ -95,15 +95,23 @@ def test_gradients_that_are_added_up():
     train(mirror(actor), torch.optim.SGD(actor.parameters(), 1e-3), every=9)
 
 
-def test_network_that_is_trained_in_part_or_later():
+def test_network_that_is_trained_in_part():
     actor = make_actor()
     train(mirror(actor), torch.optim.SGD(actor[0].module[2].parameters(), 1e-3))
-    loss, optimizer, data = mirror(make_actor()), torch.optim.SGD(actor.parameters(), 1e-3), make_batch()
-    for _ in range(STEPS):  # held, and cleared, but not moved yet
-        optimizer.zero_grad()
-        loss(data)
-    frozen = make_actor().requires_grad_(False)
-    train(lambda data: {"loss_mirror": mirror(frozen)(data)["loss_mirror"].requires_grad_()}, None)
+
+
+def test_network_that_is_trained_later():
+    """Its optimizer clears the gradients, and does not step yet."""
+    actor = make_actor()
+    optimizer = torch.optim.SGD(actor.parameters(), 1e-3)
+    optimizer.step = lambda: None
+    train(mirror(actor), optimizer)
+
+
+def test_frozen_network_beside_one_that_learns():
+    loss, other = mirror(make_actor().requires_grad_(False)), nn.Linear(1, 1)
+    for _ in range(STEPS):
+        (loss(make_batch())["loss_mirror"] + other.weight.sum()).backward()
 
 
 def test_metric_of_a_network_that_is_trained_elsewhere():

@@ -109,7 +109,7 @@ class Effect:
 
     def _restart(self) -> None:
         self._parameters: list[nn.Parameter] | None = None
-        self._seen: tuple[list[int], Tensor] | None = None
+        self._seen: tuple[list[int], list[Tensor]] | None = None
         self._proven = False
 
     def __getstate__(self) -> dict[str, HeldNetwork]:  # a copy's counters start anew
@@ -146,17 +146,16 @@ class Effect:
 
     def _require_change(self, parameters: list[nn.Parameter], patience: int) -> None:
         piled = max((p.grad._version for p in parameters if p.grad is not None), default=0)
-        if piled < patience // 2 or _capturing(parameters[0]):
+        if piled == 0 or piled < patience // 2 or _capturing(parameters[0]):
             return  # cleared again and again: an optimizer holds them
         versions = [p._version for p in parameters]
-        with torch.no_grad():
-            sums = torch.stack([p.double().sum() for p in parameters])
+        sums = [p.detach().sum(dtype=torch.promote_types(p.dtype, torch.float32)) for p in parameters]
         if self._seen is None:
             self._seen = versions, sums
         elif piled >= patience:
             # a fused optimizer counts no change, so that the values decide; once in a run
-            self._proven = versions != self._seen[0] or not torch.equal(sums, self._seen[1])
-            if not self._proven:
+            same = versions == self._seen[0] and all(map(torch.equal, sums, self._seen[1]))
+            if same:
                 raise RuntimeError(
                     f"{piled} gradients have been added up in the parameters of the network that writes "
                     f"{self.held.module.out_keys}, and nobody has cleared them or changed the parameters: "
@@ -165,6 +164,7 @@ class Effect:
                     "symmetry=...), which reaches them. If so many gradients are added up on purpose, "
                     "raise the loss's patience"
                 )
+            self._proven = True
 
 
 def _capturing(parameter: nn.Parameter) -> bool:
