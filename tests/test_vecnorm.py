@@ -165,8 +165,10 @@ def test_half_precision():
     assert rollout["observation"].dtype == torch.bfloat16
     reference, norm = normalised(["observation"])
     reference.rollout(300)
+    before = env.transform.loc["observation"]
     env.transform.bfloat16()
     loc = env.transform.loc["observation"]
+    assert torch.equal(loc, before)
     assert loc.dtype == torch.float32
     torch.testing.assert_close(loc, norm.loc["observation"], rtol=2e-3, atol=2e-3)
 

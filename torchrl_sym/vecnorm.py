@@ -149,12 +149,13 @@ class SymmetricVecNorm(VecNormV2):
         return super().get_extra_state()
 
     def _apply(self, fn: Any, recurse: bool = True) -> SymmetricVecNorm:
-        dtypes = None if self._loc is None else self._loc.apply(lambda x: x.new_empty(0))
+        exact = None if self._loc is None else (self._loc, self._var)
         super()._apply(fn, recurse)
-        if dtypes is not None:  # in no less precision than before
+        if exact is not None:  # moved, but not rounded
+            moved = (self._loc, self._var)
             self._loc, self._var = (
-                stats.apply(lambda x, like: x.to(torch.promote_types(x.dtype, like.dtype)), dtypes)
-                for stats in (self._loc, self._var)
+                old.apply(lambda x, new: x.to(new.device), new)
+                for old, new in zip(exact, moved, strict=True)
             )
         return self
 
