@@ -9,11 +9,13 @@ from __future__ import annotations
 import copy
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor
+from torch.nn.parameter import is_lazy
 from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, step_mdp
@@ -143,8 +145,11 @@ def copies(transforms: Sequence[Transform], env: EnvBase) -> list[Transform]:
     """Copies that share nothing with the transforms of an environment, and belong to none."""
     parts = [m for t in transforms for m in t.modules() if isinstance(m, Transform)]
     owners = [owner for t in parts for owner in (t.container, t.__dict__.get("_parent"))]
-    forgotten = {id(owner): None for owner in (*owners, env, bare(env)) if owner is not None}
-    copied = [copy.deepcopy(t, dict(forgotten)) for t in transforms]
+    known: dict[int, Any] = {id(owner): None for owner in (*owners, env, bare(env)) if owner is not None}
+    for tensor in (x for t in transforms for x in (*t.buffers(), *t.parameters())):
+        if is_lazy(tensor):  # not yet of any size, which deepcopy refuses
+            known[id(tensor)] = type(tensor)(device=tensor.device, dtype=tensor.dtype)
+    copied = [copy.deepcopy(t, dict(known)) for t in transforms]
     for part in (m for t in copied for m in t.modules() if isinstance(m, Transform)):
         part.reset_parent()
     return copied

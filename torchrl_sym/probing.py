@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Sequence
 
 from tensordict import NestedKey
-from torchrl.envs import EnvBase, ObservationNorm, Transform, TransformedEnv, VecNorm, VecNormV2
+from torchrl.envs import EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
 from torchrl_sym.environments import inside, shell, undisturbed
 from torchrl_sym.trial import Declared, Trial
@@ -103,13 +103,6 @@ def _related(transforms: Sequence[Transform], keys: Sequence[NestedKey]) -> set[
 
 def _refuse_untried(transform: Transform, related: set[NestedKey]) -> None:
     name = type(transform).__name__
-    if isinstance(transform, ObservationNorm) and not transform.initialized:
-        if related & {*transform.in_keys, *transform.out_keys}:
-            raise ValueError(
-                f"{name} of {transform.in_keys} has no constants yet; give them, or call init_stats(), "
-                f"before the symmetry is checked; {_REMEDY}"
-            )
-        return
     _refuse_statistics(transform, related)
     warnings.warn(
         f"{name} cannot be tried out away from its environment: whether it commutes with the symmetry is "

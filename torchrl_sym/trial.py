@@ -25,7 +25,7 @@ from torchrl_sym.playback import Layout, copies, play
 Image = Callable[[TensorDictBase, int], TensorDictBase]
 """The image of declared entries under an element, by index."""
 
-_STEPS = 3  # observations that are played: a reset, and enough for what looks back
+_STEPS = 2  # observations that are played: one after a reset, and another for what looks back
 _SIZES = (0.1, 1.0, 10.0, 100.0)  # of observations without bounds: a clip acts at some of them
 
 
@@ -208,8 +208,8 @@ class Trial:
         is_action = index >= self.seen.dim
         layout, place = (self.taken, index - self.seen.dim) if is_action else (self.seen, index)
         key, entry = layout.locate(place)
-        what = "action" if is_action else "state"
-        return f"for the image of a {what} under {name!r}, entry {entry} of {key!r} is {a:.4g}, not {b:.4g}"
+        what = "an action" if is_action else "a state"
+        return f"for the image of {what} under {name!r}, entry {entry} of {key!r} is {a:.4g}, not {b:.4g}"
 
     @property
     def inside(self) -> Declared:

@@ -90,15 +90,16 @@ class SymmetricVecNorm(VecNormV2):
     @dispatch(source="in_keys", dest="out_keys")
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Update by a batch, as from a replay buffer, and normalise it, with what is under ``"next"``."""
-        current = tensordict.select(*self.in_keys, strict=not self.missing_tolerance)
-        following = tensordict.get("next", None)
+        out = tensordict.copy()  # not in place: a buffer may hand out what it stores
+        current = out.select(*self.in_keys, strict=not self.missing_tolerance)
+        following = out.get("next", None)
         with self.lock:
             self._maybe_stateful_init(current[(0,) * current.ndim])
             self._stateful_update(current)
-            tensordict.update(self._stateful_norm(current))
+            out.update(self._stateful_norm(current))
             if following is not None:
                 following.update(self._stateful_norm(following.select(*self.in_keys, strict=False)))
-        return tensordict
+        return out
 
     def _maybe_stateful_init(self, data: TensorDictBase) -> None:
         fresh = not self.initialized
@@ -141,13 +142,20 @@ class SymmetricVecNorm(VecNormV2):
         scale = None if loc_only else self._var.sqrt().clamp_min(self.eps)
         return self._loc.clone(), scale
 
+    def get_extra_state(self) -> dict[str, Any]:
+        if self._loc is not None:  # an EnvCreator gives this state to workers, which fork or are spawned
+            for stats in (self._loc, self._var, self._count):
+                stats.share_memory_()
+        return super().get_extra_state()
+
     def _apply(self, fn: Any, recurse: bool = True) -> SymmetricVecNorm:
-        dtypes = None if self._loc is None else self._loc.apply(lambda x: x.new_empty(0))
+        exact = None if self._loc is None else (self._loc, self._var)
         super()._apply(fn, recurse)
-        if dtypes is not None:  # in no less precision than before
+        if exact is not None:  # moved, but not rounded
+            moved = (self._loc, self._var)
             self._loc, self._var = (
-                stats.apply(lambda x, like: x.to(torch.promote_types(x.dtype, like.dtype)), dtypes)
-                for stats in (self._loc, self._var)
+                old.apply(lambda x, new: x.to(new.device), new)
+                for old, new in zip(exact, moved, strict=True)
             )
         return self
 
