@@ -7,12 +7,13 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.keyed import KeyedModule
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry
 
@@ -125,21 +126,21 @@ def make_actor(
     bounds = (config.min_std, config.max_std)
     policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        KeyedModule(policy, in_keys, ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
     )
 
 
-def make_critic(config: PPOConfig, in_keys: Sequence[NestedKey], in_size: int) -> ValueOperator:
+def make_critic(config: PPOConfig, in_keys: Sequence[NestedKey], in_size: int) -> KeyedModule:
     """State value on the concatenated inputs."""
-    return ValueOperator(FeedForward(in_size, 1, config.hidden), in_keys=list(in_keys))
+    return KeyedModule(FeedForward(in_size, 1, config.hidden), in_keys, ["state_value"])
 
 
 def make_networks(
     config: PPOConfig, env: EnvBase, symmetry: Symmetry
-) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
+) -> tuple[ProbabilisticTensorDictSequential, KeyedModule]:
     """Actor and critic that read every observation of the environment that the symmetry declares.
 
     Raises:
