@@ -1,7 +1,7 @@
 """The learning rate that follows the policy's change, as rsl_rl adapts it.
 
-TorchRL's ``KLAdaptiveLR`` has the same rule in Python numbers: the host then waits for every minibatch on an
-accelerator, before it can prepare the next. Here the rate stays where the networks are.
+TorchRL's ``KLAdaptiveLR`` has the same rule in Python numbers: the host then waits for each minibatch of an
+accelerator before it can prepare the next. Here the rate stays where the networks are.
 """
 
 from __future__ import annotations
