@@ -93,7 +93,8 @@ class Learner:
         """One step of the optimizer; returns the losses and diagnostics that are single numbers."""
         out = self.evaluate(minibatch)
         total = sum(value for key, value in out.items() if key.startswith("loss_"))
-        self.optimizer.zero_grad()
+        for parameter in self.parameters:  # the optimizer's zero_grad() takes ten times as long
+            parameter.grad = None
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
         # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
