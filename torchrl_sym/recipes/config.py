@@ -110,6 +110,11 @@ class PPOConfig:
     """Iterations between checkpoints; the last one is always saved."""
     device: str = "cpu"
     """Where networks and updates live; physics stays on the CPU."""
+    compile: bool = False
+    """Compile the losses, where there is a compiler: about a minute before the first update."""
+    autocast: Literal["bfloat16"] | None = None
+    """Precision of the matrix products in the losses, None for that of the networks. Advantages, actions
+    and the parameters keep theirs."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -152,11 +157,11 @@ class PPOConfig:
     def differences(self, stored: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
 
-        Iterations, checkpoint interval and device may change when a run is continued; iterations only if
-        no schedule depends on them. A field that was added after the configuration was stored counts as
-        having had its default.
+        Iterations, checkpoint interval, device and compilation may change when a run is continued;
+        iterations only if no schedule depends on them. A field that was added after the configuration was
+        stored counts as having had its default.
         """
-        free = {"checkpoint_interval", "device"}
+        free = {"checkpoint_interval", "device", "compile"}
         if self.std_schedule is None or self.std_schedule[0] == self.std_schedule[1]:
             free.add("iterations")
         other = dataclasses.asdict(PPOConfig(**stored))
@@ -170,6 +175,7 @@ class PPOConfig:
 _CHOICES = {
     "augmentation": ("none", "all", "random", "naive"),
     "adapt_every": ("minibatch", "iteration"),
+    "autocast": ("bfloat16",),
 }
 _RANGES: dict[str, dict[str, float]] = {
     "gamma": {"low": 0, "high": 1},
@@ -191,14 +197,14 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         TypeError: not of the field's type.
         ValueError: out of its range.
     """
+    if value is None and kind.endswith("None"):
+        return None
     if name in _CHOICES:
         return one_of(name, value, _CHOICES[name])
     if name == "device":
         return _device(value)
     if kind == "bool":
         return flag(name, value)
-    if value is None and kind.endswith("None"):
-        return None
     if kind.startswith("tuple[NestedKey"):
         return _keys(name, value)
     if kind.startswith("tuple[int"):

@@ -82,8 +82,5 @@ def symmetry_metrics(
     copies = log_prob[1:] if len(log_prob) > 1 else log_prob
     action = deterministic_action(dist)  # pi(L_g[s])
     error = mirror_error(action, action[0], symmetry["action"], range(len(action)))
-    return {
-        "mirror_loss": float(error.sum(0).mean()),
-        "log_prob": float(log_prob[0].mean()),
-        "log_prob_copies": float(copies.mean()),
-    }
+    means = torch.stack([error.sum(0).mean(), log_prob[0].mean(), copies.mean()])
+    return dict(zip(("mirror_loss", "log_prob", "log_prob_copies"), means.tolist(), strict=True))

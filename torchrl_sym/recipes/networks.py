@@ -8,13 +8,14 @@ from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
 from torchrl_sym.normalization import SymmetricNorm
 from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.keyed import KeyedModule
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry
 
@@ -154,7 +155,7 @@ def make_actor(
     bounds = (config.min_std, config.max_std)
     policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        KeyedModule(policy, in_keys, ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
@@ -168,11 +169,11 @@ def make_critic(
     *,
     norm: SymmetricNorm | None = None,
     event_dims: Sequence[int] | None = None,
-) -> ValueOperator:
+) -> KeyedModule:
     """State value on the concatenated inputs; arguments as of :func:`make_actor`."""
     _require_norm(config, norm)
     net = FeedForward(in_size, 1, config.hidden, norm=norm, event_dims=event_dims)
-    return ValueOperator(net, in_keys=list(in_keys))
+    return KeyedModule(net, in_keys, ["state_value"])
 
 
 def _require_norm(config: PPOConfig, norm: SymmetricNorm | None) -> None:
@@ -185,7 +186,7 @@ def _require_norm(config: PPOConfig, norm: SymmetricNorm | None) -> None:
 
 def make_networks(
     config: PPOConfig, env: EnvBase, symmetry: Symmetry
-) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
+) -> tuple[ProbabilisticTensorDictSequential, KeyedModule]:
     """Actor and critic that read the observations of the environment that the symmetry declares.
 
     Which of them actor and critic read, ``config.actor_keys`` and ``config.critic_keys`` say: what a robot

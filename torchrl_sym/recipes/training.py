@@ -249,6 +249,7 @@ class _Run:
             policy_device=elsewhere,
             storing_device=elsewhere,
             auto_register_policy_transforms=False,
+            track_traj_ids=False,
         )
         log = make_logger(logger, None if self.folder is None else self.folder.path, name="train")
         bar = tqdm(total=config.iterations, initial=self.done, disable=not progress, unit="it")
@@ -308,11 +309,12 @@ class _Run:
 
 def _require_finite(data: TensorDictBase, keys: Iterable[NestedKey]) -> None:
     """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
-    for key in [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]:
-        wrong = data[key].isfinite().logical_not()
-        if bool(wrong.any()):
-            bad = int(wrong.flatten(data.ndim).any(-1).sum())
-            raise FloatingPointError(
-                f"expected finite numbers, got others in {key!r} of {bad} of {data.numel()} samples; end "
-                "episodes before the simulation diverges"
-            )
+    names = [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]
+    finite = torch.stack([data[name].isfinite().all() for name in names]).tolist()  # fetched at once
+    for name in (name for name, good in zip(names, finite, strict=True) if not good):
+        wrong = data[name].isfinite().logical_not()
+        bad = int(wrong.flatten(data.ndim).any(-1).sum())
+        raise FloatingPointError(
+            f"expected finite numbers, got others in {name!r} of {bad} of {data.numel()} samples; end "
+            "episodes before the simulation diverges"
+        )
