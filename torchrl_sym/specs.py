@@ -7,7 +7,6 @@ from collections.abc import Sequence
 import torch
 from tensordict import NestedKey
 from tensordict.utils import unravel_key
-from torch import Tensor
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import (
@@ -90,16 +89,16 @@ def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) 
     """ValueError unless every element maps the box of a bounded spec onto itself."""
     if not _has_box(spec):
         return
+    vector = representation.flatten()
     bounds = [
-        bound.double().cpu().expand(spec.shape).reshape(-1, representation.dim)
+        bound.double().cpu().expand(spec.shape).reshape(-1, vector.dim)
         for bound in (spec.space.low, spec.space.high)
     ]
-    matrices = representation.matrices.cpu()
     for row in torch.cat(bounds, dim=-1).unique(dim=0):  # environments of a batch share their box
         if row.isnan().any():
             raise ValueError(f"{key!r}: expected a box of numbers, got NaN in its bounds")
         row_low, row_high = row.chunk(2)
-        image_low, image_high = image_of_box(matrices, row_low, row_high)  # (N, d)
+        image_low, image_high = vector.image_of_box(row_low, row_high)  # (N, d)
         wrong = ~(
             torch.isclose(image_low, row_low, atol=1e-6) & torch.isclose(image_high, row_high, atol=1e-6)
         )
@@ -111,12 +110,6 @@ def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) 
                 f"[{image_low[g, i]:g}, {image_high[g, i]:g}]; make the box symmetric (actions relative "
                 "to a symmetric default pose, equal limits on both sides)"
             )
-
-
-def image_of_box(matrices: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-    """Bounds of the images of a box ``(d,)`` under matrices ``(..., d, d)``; 0 * inf counts as 0."""
-    ends = [torch.where(matrices == 0, 0.0, matrices * bound) for bound in (low, high)]
-    return torch.minimum(*ends).sum(-1), torch.maximum(*ends).sum(-1)
 
 
 def check_normalizers(env: EnvBase, keys: Sequence[NestedKey]) -> None:

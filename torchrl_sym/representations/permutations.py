@@ -44,7 +44,7 @@ def signed_permutation(
     """
     check_group(group)
     names = checks.names("names", names)
-    known = {0: (torch.arange(len(names)), torch.ones(len(names), dtype=torch.int8))}
+    known = {0: (torch.arange(len(names), device="cpu"), torch.ones(len(names), dtype=torch.int8))}
     given = {group.index(g): _parse(g, names, targets) for g, targets in _check_maps(maps).items()}
     frontier = [0]
     while frontier:  # walk the group from the identity by the given elements
@@ -89,8 +89,8 @@ def _check_maps(maps: Mapping[str, Mapping[str, str]]) -> Mapping[str, Mapping[s
 
 
 def _parse(element: str, names: list[str], targets: Mapping[str, str]) -> tuple[Tensor, Tensor]:
-    index = torch.full((len(names),), -1)
-    sign = torch.ones(len(names), dtype=torch.int8)
+    index = torch.full((len(names),), -1, device="cpu")
+    sign = torch.ones(len(names), dtype=torch.int8, device="cpu")
     for source, target in targets.items():
         goal = target.removeprefix("-")
         for name in (source, goal):
@@ -153,7 +153,7 @@ def points(
             f"{_metres(positions[i])} is sent to {_metres(moved[g, i])}, where there is none; center "
             "the layout on the axis of the group (for turns of 120 degrees use rings, not a grid)"
         )
-    if (landing.sort(dim=-1).values != torch.arange(len(positions))).any():
+    if (landing.sort(dim=-1).values != torch.arange(len(positions), device="cpu")).any():
         raise ValueError(f"expected distinct points, got two within {tolerance} m of each other")
     index = landing.argsort(dim=-1)  # entry landing[g, i] of the image comes from entry i
     heights = Representation.from_blocks(group, [SignedPermutation(index, torch.ones_like(index))])
