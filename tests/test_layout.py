@@ -29,7 +29,7 @@ LAYERS = (
     "declaration",
     "specs",
     "symmetry",
-    "orbits memory",
+    "orbits memory networks outputs",
     "augment transforms replay mirror_loss symmetric_ppo modules normalization mujoco testing",
     "recipes",
     "__init__",
