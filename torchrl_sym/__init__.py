@@ -2,12 +2,13 @@
 
 from importlib.metadata import PackageNotFoundError, version
 
+from torchrl_sym.augment import SymmetryAugment
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.replay import SymmetryOrbit, SymmetryReplayBuffer
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
 from torchrl_sym.symmetry import Symmetry
-from torchrl_sym.transforms import SymmetryAugment, SymmetryOrbit
 
 __all__ = [
     "MirrorLoss",
@@ -17,6 +18,7 @@ __all__ = [
     "Symmetry",
     "SymmetryAugment",
     "SymmetryOrbit",
+    "SymmetryReplayBuffer",
 ]
 
 try:

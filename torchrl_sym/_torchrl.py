@@ -3,6 +3,9 @@
 TorchRL may change them in any release; ``tests/test_torchrl_contracts.py`` says what we expect of each.
 """
 
+from tensordict import NestedKey
+from torchrl.data import ReplayBuffer
+from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
 from torchrl.envs import EnvBase, SerialEnv
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
@@ -11,7 +14,13 @@ from torchrl.objectives.ppo import (
     _check_advantage_broadcast as check_advantage_broadcast,
 )
 
-__all__ = ["broadcast_advantage_to_log_weight", "check_advantage_broadcast", "serial_workers"]
+__all__ = [
+    "broadcast_advantage_to_log_weight",
+    "buffers_sampling_by",
+    "check_advantage_broadcast",
+    "cuts_by",
+    "serial_workers",
+]
 
 
 def serial_workers(env: SerialEnv) -> list[EnvBase]:
@@ -19,3 +28,13 @@ def serial_workers(env: SerialEnv) -> list[EnvBase]:
     if env.is_closed:
         env.start()
     return list(dict(zip(env.create_env_fn, env._envs, strict=True)).values())
+
+
+def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer]:
+    """The replay buffers of a storage that have a sample unit."""
+    return [buffer for buffer in storage._attached_entities if buffer._sample_unit is unit]
+
+
+def cuts_by(sampler: SliceSampler, key: NestedKey) -> bool:
+    """Whether a sampler takes slices between changes of this entry, wherever the storage has it."""
+    return sampler.traj_key == key or getattr(sampler, "_traj_key_auto", False)

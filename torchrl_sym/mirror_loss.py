@@ -25,9 +25,9 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from torchrl_sym import checks
-from torchrl_sym.networks import Effect, HeldNetwork, check_network, evaluating
+from torchrl_sym.memory import Memory
+from torchrl_sym.networks import Effect, HeldNetwork, check_network, evaluating, inputs
 from torchrl_sym.outputs import compared, deterministic_action, is_q_function, output_key, own_keys
-from torchrl_sym.outputs import single_action as single_action  # where SymmetricClipPPOLoss looks for it
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 
@@ -65,10 +65,11 @@ def mirror_error(
         if act is None:
             label = source
         elif isinstance(g, Tensor):
-            label = act(source, g)
+            label = act.per_row(source, g)
         else:
             label = torch.stack([act(source, element) for element in g])
-    return squared_distance(output, label, _event_dims(act))
+    dims = 1 if act is None else len(act.event_shape)
+    return (output - label).pow(2).sum(tuple(range(-dims, 0)))
 
 
 class MirrorLoss(LossModule):
@@ -96,6 +97,9 @@ class MirrorLoss(LossModule):
         stop_gradient: treat K_g[pi(s)] as a label. Defaults to ``True``, as in the paper.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
         per_element: also return ``mirror_error``, the unweighted error of each element, ``(N,)``.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and do not count. Defaults to 0: such
+            sequences are refused.
         functional: as in other TorchRL losses. Defaults to ``True``.
 
     Attributes:
@@ -157,6 +161,7 @@ class MirrorLoss(LossModule):
         stop_gradient: bool = True,
         reduction: str | None = None,
         per_element: bool = False,
+        burn_in: int = 0,
         functional: bool = True,
     ) -> None:
         borrowed = isinstance(actor_network, HeldNetwork)  # of another loss
@@ -181,7 +186,9 @@ class MirrorLoss(LossModule):
         self.set_keys(**own_keys(self.actor_network, symmetry, self.tensor_keys))
         if output_key(self.actor_network, self.tensor_keys):  # else it may still be named with set_keys
             self._find_output()
-        symmetry.require(self.actor_network.in_keys, "the network")
+        copies = symmetry.group.order > 1
+        self.memory = Memory.of(symmetry, [self.actor_network], burn_in=burn_in, copies=copies)
+        symmetry.require(self.in_keys, "the network")
 
     @classmethod
     def of(cls, loss: LossModule, network: str = "qvalue_network", **options: Any) -> MirrorLoss:
@@ -256,7 +263,7 @@ class MirrorLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """What the network reads."""
         if self._in_keys is None:
-            self._in_keys = list(self.actor_network.in_keys)
+            self._in_keys = inputs(self.actor_network)
         return self._in_keys
 
     @in_keys.setter
@@ -285,6 +292,7 @@ class MirrorLoss(LossModule):
         return self._compared
 
     def _output(self, tensordict: TensorDictBase) -> Tensor:
+        """What is compared, of rows ``[*B]``."""
         if hasattr(self.actor_network, "get_dist"):
             return deterministic_action(self.actor_network.get_dist(tensordict))
         key, _ = self._find_output()
@@ -303,15 +311,22 @@ class MirrorLoss(LossModule):
         if self.stop_gradient and len(orbit) > 1:
             with torch.no_grad():
                 source = self._output(orbit[0])
-            return mirror_error(self._output(orbit[1:]), source, act, elements[1:])
-        output = self._output(orbit)
+            return mirror_error(self._images(orbit[1:]), source, act, elements[1:])
+        output = self._images(orbit)
         return mirror_error(output, output[0], act, elements, stop_gradient=self.stop_gradient)
+
+    def _images(self, orbit: TensorDictBase) -> Tensor:
+        """What is compared, of ``[n, *B]``; as rows, since many networks take no more dimensions."""
+        rows = orbit.reshape(-1, *orbit.batch_size[2:])
+        return self._output(rows).unflatten(0, orbit.batch_size[:2])
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.actor_network.in_keys, strict=False), self.in_keys[0])
-        orbit = self.symmetry.orbit(state)  # [N, *B], identity first
+        tensordict = batched(tensordict.clone(False), self.in_keys[0], self.symmetry)
+        tensordict = self.memory.prepare(tensordict, self._loss_mask_keys())
+        state = tensordict.select(*self.symmetry.together(self.in_keys), strict=False)
+        orbit = self.memory.rebuild(self.symmetry.orbit(state))  # [N, *B], identity first
         with evaluating(self.actor_network):
             members = self._held.each(lambda: self._error(orbit))
         error = functools.reduce(torch.add, members)  # (N or N - 1, *B)
@@ -335,19 +350,10 @@ _COPIES = (
 )
 
 
-def squared_distance(output: Tensor, label: Tensor, event_dims: int = 1) -> Tensor:
-    """Sum of squared differences over the last dimensions."""
-    return (output - label).pow(2).sum(tuple(range(-event_dims, 0)))
-
-
-def _event_dims(act: Representation | None) -> int:
-    return len(getattr(act, "event_shape", (1,)))
-
-
-def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
+def batched(tensordict: TensorDictBase, key: NestedKey, symmetry: Symmetry) -> TensorDictBase:
     """Give a tensordict that a keyword call has built the batch size of one of its entries.
 
-    ``dispatch`` takes the longest shape that all entries share, at times with their last dimension.
+    ``dispatch`` takes the longest shape that all entries share, at times with event dimensions.
     """
     value = tensordict.get(key, None)
     if value is None:
@@ -355,6 +361,7 @@ def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
             f"expected an entry {key!r}, which the network reads; the batch has "
             f"{sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))}"
         )
-    if tensordict.batch_dims in (0, value.ndim):
-        tensordict.batch_size = value.shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
+    size = value.shape[: value.ndim - symmetry.event_dims(key)]
+    if tensordict.batch_dims == 0 or tensordict.batch_dims > len(size):
+        tensordict.batch_size = size  # pyright: ignore[reportAttributeAccessIssue]
     return tensordict

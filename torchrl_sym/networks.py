@@ -16,6 +16,7 @@ from typing import TypeVar
 import torch
 from tensordict import NestedKey, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import unravel_key
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
@@ -174,3 +175,10 @@ def check_network(name: str, network: TensorDictModule) -> None:
     """TypeError unless a network reads and writes tensordicts."""
     remedy = "wrap a network in TensorDictModule, ProbabilisticActor or ValueOperator"
     checks.instance(name, network, TensorDictModuleBase, remedy)
+
+
+def inputs(network: TensorDictModule) -> list[NestedKey]:
+    """What a network reads from a batch; not the group of parameters that its own modules fill."""
+    written = [key for key in network.out_keys if isinstance(key, tuple)]
+    filled = {unravel_key(key[:depth]) for key in written for depth in range(1, len(key))}
+    return [key for key in network.in_keys if unravel_key(key) not in filled]

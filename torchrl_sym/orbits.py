@@ -14,6 +14,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
+from torchrl_sym.memory import Memory
 from torchrl_sym.symmetry import Symmetry
 
 
@@ -26,7 +27,7 @@ class Copies:
         keys: what differs between copies; they share every other entry.
         followers: entries that follow an action, by its key.
         elements: indices of the elements to apply, the identity first; None to draw one for each row.
-        per_sequence: draw one for each sequence ``[B]`` of a batch ``[B, T]``.
+        memory: what recurrent networks know of their past.
         mask_keys: entries that say which rows count.
 
     Attributes:
@@ -44,20 +45,21 @@ class Copies:
         followers: Mapping[NestedKey, NestedKey],
         elements: Sequence[int] | None,
         *,
-        per_sequence: bool = False,
+        memory: Memory,
         mask_keys: Iterable[NestedKey] = (),
     ) -> None:
         self.td = originals
         self.mask_keys = list(mask_keys)
         if elements is None:
             self.count = symmetry.group.order
-            self.element = symmetry.draw(originals, per_sequence=per_sequence)
-            self.expanded = symmetry.per_row(originals, self.element, keys=keys, followers=followers)
+            self.element = memory.draw(symmetry, originals)
+            copies = symmetry.per_row(originals, self.element, keys=keys, followers=followers)
+            self.expanded = memory.rebuild(copies, self.element)
         else:
             self.count = len(elements)
             self.element = None
             orbit = symmetry.orbit(originals, elements, keys=keys, followers=followers)
-            self.expanded = orbit.reshape(-1, *originals.batch_size[1:])
+            self.expanded = memory.rebuild(orbit).reshape(-1, *originals.batch_size[1:])
 
     def originals(self, x):
         """Rows of the identity, of a tensor or tensordict: such that their mean is theirs.

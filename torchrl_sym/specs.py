@@ -1,4 +1,4 @@
-"""Whether an environment's sizes, boxes and transforms fit a representation."""
+"""Whether an environment's sizes and boxes fit a representation."""
 
 from __future__ import annotations
 
@@ -6,21 +6,12 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import NestedKey
-from tensordict.utils import unravel_key
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
-from torchrl.envs import (
-    Compose,
-    EnvBase,
-    InitTracker,
-    RewardSum,
-    StepCounter,
-    TransformedEnv,
-    VecNorm,
-    VecNormV2,
-)
+from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter
 
 from torchrl_sym.declaration import check_events
+from torchrl_sym.entries import split
 from torchrl_sym.environments import transforms_of
 from torchrl_sym.representations import Representation
 
@@ -55,15 +46,17 @@ def check_part(
         check_box(key, found[0] if len(found) == 1 else _joined(found, representation), representation)
 
 
-def counted_keys(env: EnvBase) -> set[NestedKey]:
-    """What TorchRL's own counters write into an environment's observations: copies share it."""
-    written: list[NestedKey] = []
+def counter_names(env: EnvBase) -> set[str]:
+    """Names under which TorchRL's own counters write observations: copies share them."""
+    names: set[str] = set()
     for transform in transforms_of(env):
         if isinstance(transform, StepCounter):
-            written += transform.step_count_keys
-        elif isinstance(transform, InitTracker | RewardSum):
-            written += transform.out_keys
-    return {unravel_key(key) for key in written}
+            names.add(transform.step_count_key)
+        elif isinstance(transform, InitTracker):
+            names.add(transform.init_key)
+        elif isinstance(transform, RewardSum):
+            names |= {split(key)[1] for key in transform.out_keys}
+    return names
 
 
 def _has_box(spec: TensorSpec) -> bool:
@@ -110,19 +103,3 @@ def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) 
                 f"[{image_low[g, i]:g}, {image_high[g, i]:g}]; make the box symmetric (actions relative "
                 "to a symmetric default pose, equal limits on both sides)"
             )
-
-
-def check_normalizers(env: EnvBase, keys: Sequence[NestedKey]) -> None:
-    """Refuse running normalisers of declared observations, whose statistics are not symmetric."""
-    while isinstance(env, TransformedEnv):
-        transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
-        for transform in transforms:
-            names = {unravel_key(key) for key in (*transform.in_keys, *transform.out_keys)}
-            touched = sorted(map(str, names & set(keys)))
-            if isinstance(transform, VecNorm | VecNormV2) and touched:
-                raise ValueError(
-                    f"{type(transform).__name__} normalises {touched} by running statistics, "
-                    " which are not symmetric, so that the mirrored observation is not the observation of "
-                    "the mirrored state; scale by constants, or normalise inside the networks"
-                )
-        env = env.base_env

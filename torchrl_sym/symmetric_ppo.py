@@ -30,15 +30,11 @@ from torchrl.objectives.utils import distance_loss
 
 from torchrl_sym import checks
 from torchrl_sym._torchrl import broadcast_advantage_to_log_weight, check_advantage_broadcast
-from torchrl_sym.entries import split
-from torchrl_sym.mirror_loss import (
-    batched,
-    check_network,
-    deterministic_action,
-    single_action,
-    squared_distance,
-)
+from torchrl_sym.memory import Memory
+from torchrl_sym.mirror_loss import batched, mirror_error
+from torchrl_sym.networks import check_network, inputs
 from torchrl_sym.orbits import Copies, variance
+from torchrl_sym.outputs import deterministic_action, single_action
 from torchrl_sym.symmetry import Elements, Symmetry, check_symmetry
 
 # Numbers of ClipPPOLoss and the least they may be; a negative weight of the entropy has its uses.
@@ -70,12 +66,16 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         mirror_coeff: weight w of the mirror loss (Eq. symm-loss), finite and not negative, added as
             ``loss_mirror``; it reuses the actor's pass over the orbit. 0 leaves it out. Schedulable when
             positive.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and count neither for them nor for their
+            originals. Defaults to 0: such sequences are refused.
         **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts, and nothing that it would ignore.
 
     Raises:
         KeyError: a network reads a key, or the action is one, that the symmetry does not declare; or
             there is no such element.
-        ValueError: a number that is not finite or out of range.
+        ValueError: a number that is not finite or out of range; in a call, sequences whose copies would
+            begin from a wrong memory.
         TypeError: an argument of another type, or of a name that neither loss knows.
 
     Example:
@@ -121,6 +121,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         symmetry: Symmetry,
         elements: Elements = "all",
         mirror_coeff: float = 0.0,
+        burn_in: int = 0,
         **clip_ppo_kwargs,
     ) -> None:
         check_symmetry(symmetry)
@@ -148,10 +149,10 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         if self._mirrors:
             self.register_coeff_buffer("mirror_coeff", mirror_coeff, device=self.entropy_coeff.device)
             single_action(self.actor_network)
+        networks = (self.actor_network, self.critic_network)
+        copies = len(self.elements) > 1
+        self.memory = Memory.of(self.symmetry, networks, burn_in=burn_in, copies=copies)
         self._require_keys()
-        # one element per sequence then, for a network must not see a history of several
-        read = [*_inputs(self.actor_network), *self._critic_inputs()]
-        self._recurrent = any(split(key)[1] == "is_init" for key in read)
 
     _schedulable_buffers = ClipPPOLoss._schedulable_buffers | {"mirror_coeff"}
 
@@ -181,8 +182,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the losses; the input is not modified."""
-        td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
+        td = batched(tensordict.clone(False), self.actor_network.in_keys[0], self.symmetry)
         self._prepare_advantage(td)
+        td = self.memory.prepare(td, self._loss_mask_keys())
         td = td.select(*self._read_keys(), strict=False)
         rows = Copies(
             self.symmetry,
@@ -190,7 +192,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             self._mapped_keys(),
             self._followers(),
             None if self.random else self.elements,
-            per_sequence=self._recurrent,
+            memory=self.memory,
             mask_keys=self._loss_mask_keys(),
         )
         advantage = rows.expanded.get(self.tensor_keys.advantage)
@@ -333,16 +335,14 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
         act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
         output = deterministic_action(dist)  # pi(L_g s)
-        if rows.element is not None:  # each row is one term of the sum, drawn with probability 1/N
-            with torch.no_grad():
-                with self._using("actor_network"):
-                    dist = self.actor_network.get_dist(rows.td)
-                label = act.per_row(deterministic_action(dist), rows.element)
-            return len(self.elements) * squared_distance(output, label).unsqueeze(-1)
-        output = output.unflatten(0, (len(self.elements), -1))
-        with torch.no_grad():
-            label = torch.stack([act(output[0], g) for g in self.elements])
-        return squared_distance(output, label).sum(0).unsqueeze(-1)
+        if rows.element is None:
+            output = output.unflatten(0, (rows.count, -1))
+            return mirror_error(output, output[0], act, self.elements).sum(0).unsqueeze(-1)
+
+        with torch.no_grad(), self._using("actor_network"):
+            source = deterministic_action(self.actor_network.get_dist(rows.td))
+        # each row is one term of the sum, drawn with probability 1/N
+        return rows.count * mirror_error(output, source, act, rows.element).unsqueeze(-1)
 
     def _reduce(self, name: str, value: Tensor, rows: Copies) -> Tensor:
         if not name.startswith("loss_"):
@@ -376,9 +376,4 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
 
 
 def _inputs(network: TensorDictModule | None) -> list[NestedKey]:
-    """What a network reads from the batch; not the group of parameters that its own modules fill."""
-    if network is None:
-        return []
-    written = [key for key in network.out_keys if isinstance(key, tuple)]
-    filled = {unravel_key(key[:depth]) for key in written for depth in range(1, len(key))}
-    return [key for key in network.in_keys if unravel_key(key) not in filled]
+    return [] if network is None else inputs(network)

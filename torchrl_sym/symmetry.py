@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, is_tensor_collection
-from tensordict.utils import unravel_key
+from tensordict import NestedKey, TensorDictBase, is_leaf_nontensor, is_tensor_collection
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -22,8 +21,10 @@ from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, split, without_next
 from torchrl_sym.groups import PointGroup, check_group
+from torchrl_sym.probing import check_transforms
 from torchrl_sym.representations import Representation
-from torchrl_sym.specs import check_normalizers, check_part, counted_keys
+from torchrl_sym.specs import check_part, counter_names
+from torchrl_sym.trial import Declared
 
 Elements = Literal["all", "random"] | Sequence[str]
 
@@ -110,6 +111,15 @@ class Symmetry(nn.Module):
         if len(names) > 1:
             raise KeyError(f"{key!r} has no representation of its own: {names} change places")
         return representation
+
+    def event_dims(self, key: NestedKey) -> int:
+        """Number of dimensions behind those of the batch, of a declared entry; 1 for any other."""
+        part = self._declaration.part(key)
+        if part is None:
+            return 1
+        names, representation = part
+        dims = len(representation.event_shape)
+        return dims - 1 if len(names) > 1 and dims > 1 else dims
 
     def require(self, keys: Iterable[NestedKey], reader: str) -> None:
         """Raise KeyError unless every key that a network reads is declared, whatever its name.
@@ -270,7 +280,7 @@ class Symmetry(nn.Module):
         """Every entry that differs between copies, with what ``act`` makes of it."""
         if keys is None:
             require_even(tensordict)
-            chosen = tensordict.keys(include_nested=True, leaves_only=True)
+            chosen = tensordict.keys(True, True, is_leaf=is_leaf_nontensor)
         else:
             chosen = [checks.key("keys", key) for key in checks.sequence("keys", keys, of="keys")]
         strict = self.strict or keys is not None  # what is asked for by name must be known
@@ -302,12 +312,11 @@ class Symmetry(nn.Module):
                 with is applied to a declared observation.
         """
         checks.instance("env", env, EnvBase)
-        check_normalizers(env, self.keys())
-        known = {*self.keys(), *counted_keys(env)}
+        counters = counter_names(env)
         unknown: list[NestedKey] = []
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
             leaves = dict(specs.items(include_nested=True, leaves_only=True))
-            unknown += [key for key in leaves if unravel_key(key) not in known]
+            unknown += [key for key in leaves if key not in self and split(key)[1] not in counters]
             for names, representation in self._declaration.parts:
                 if any(name in leaves for name in names):
                     found = {name: leaves[name] for name in names if name in leaves}
@@ -317,6 +326,7 @@ class Symmetry(nn.Module):
                 f"the environment has {unknown}, which this symmetry does not know (it has {self.keys()}); "
                 "add their representations, e.g. invariant(group, d) for what no element changes"
             )
+        check_transforms(env, Declared(self.keys(), self, self.group.names))
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self.keys()}"

@@ -21,12 +21,12 @@ from torchrl.modules import ValueOperator
 from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR, LossModule
 from torchrl.objectives.value import GAE
 
+from torchrl_sym.augment import SymmetryAugment
 from torchrl_sym.mirror_loss import MirrorLoss
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.networks import gaussian
 from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
 from torchrl_sym.symmetry import Symmetry
-from torchrl_sym.transforms import SymmetryAugment
 
 
 class Learner:
