@@ -6,7 +6,7 @@ the action, because an actor or an estimator wrote them beside it; and some are 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -105,7 +105,7 @@ class Declaration:
         parts: list[Part] = []
         unknown: list[NestedKey] = []
         done: set[NestedKey] = set()
-        for key in chosen:
+        for key in _leaves(batch, chosen):
             value = batch.get(key, None)
             part = self.part(key)
             if value is None and part is None and not (is_per_row(key) or is_bookkeeping(key)):
@@ -183,6 +183,16 @@ class Declaration:
                     f"is declared by itself; declare them together: Exchanged({here!r}, {there!r}) with "
                     "items(places, representation), or with the sum of both if they really stay in place"
                 )
+
+
+def _leaves(batch: TensorDictBase, chosen: Iterable[NestedKey]) -> Iterator[NestedKey]:
+    """Entries by their own keys: a network may read a group of them, as one of several agents does."""
+    for key in chosen:
+        value = batch.get(key, None)
+        if isinstance(value, TensorDictBase):
+            yield from (unravel_key((key, leaf)) for leaf in value.keys(True, True))
+        else:
+            yield key
 
 
 def require_even(batch: TensorDictBase) -> None:

@@ -111,6 +111,12 @@ def join(parent: tuple[str, ...], leaf: str) -> NestedKey:
     return unravel_key((*parent, leaf))
 
 
+def enclosing(key: NestedKey) -> list[NestedKey]:
+    """The groups that an entry is in."""
+    parent = split(key)[0]
+    return [unravel_key(parent[:depth]) for depth in range(1, len(parent) + 1)]
+
+
 def uneven_keys(tensordict: TensorDictBase, prefix: tuple[str, ...] = ()) -> list[NestedKey]:
     """Entries that only some rows of a lazy stack have; its own keys are those that all rows have."""
     if isinstance(tensordict, LazyStackedTensorDict):

@@ -361,6 +361,8 @@ def batched(tensordict: TensorDictBase, key: NestedKey, symmetry: Symmetry) -> T
             f"expected an entry {key!r}, which the network reads; the batch has "
             f"{sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))}"
         )
+    if isinstance(value, TensorDictBase):
+        return tensordict  # a group, whose own size does not tell
     size = value.shape[: value.ndim - symmetry.event_dims(key)]
     if tensordict.batch_dims == 0 or tensordict.batch_dims > len(size):
         tensordict.batch_size = size  # pyright: ignore[reportAttributeAccessIssue]

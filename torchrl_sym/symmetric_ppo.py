@@ -288,9 +288,14 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         td = rows.expanded.detach() if self.separate_losses else rows.expanded
         keys = self.tensor_keys
         target, old = td.get(keys.value_target, None), td.get(keys.value, None)
-        if target is None or (self._clips_value and old is None):
-            lacking = keys.value_target if target is None else keys.value
-            raise KeyError(f"expected an entry {lacking!r} in the batch, which a value estimator writes")
+        if target is None:
+            raise KeyError(f"expected {keys.value_target!r} in the batch, which a value estimator writes")
+        if self._clips_value and old is None:  # in the words of ClipPPOLoss
+            raise KeyError(
+                f"clip_value is set to {self.clip_value}, but the key {keys.value} was not found in the "
+                "input tensordict. Make sure that the 'value' key passed to PPO exists in the input "
+                "tensordict, where a value estimator writes it."
+            )
         with self._using("critic_network"):
             value = self.critic_network(td).get(keys.value, None)
         if value is None:
@@ -352,13 +357,16 @@ def _check_numbers(arguments: Mapping[str, Any]) -> None:
         value = arguments[name]
         if (value is None and name != "clip_epsilon") or (name == "clip_value" and isinstance(value, bool)):
             continue  # a default, or the bound of the ratio
-        parts = [value]
-        if name == "clip_epsilon" and isinstance(value, tuple | list) and len(value) == 2:
-            parts = list(value)  # below and above
+        least, parts = _LEAST[name], [value]
+        if name == "clip_epsilon" and isinstance(value, tuple | list):
+            if len(value) != 2:
+                shown = checks.shown(value)
+                raise ValueError(f"{name}: expected a number, or two as a tuple of length 2, got {shown}")
+            least, parts = None, list(value)  # below and above, whose signs ClipPPOLoss checks
         if name == "entropy_coeff" and isinstance(value, Mapping):
             parts = list(value.values())  # one for each head
         for part in parts:
-            checks.real(name, part, _LEAST[name])
+            checks.real(name, part, least)
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:

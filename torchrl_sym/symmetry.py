@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl_sym import checks
 from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
-from torchrl_sym.entries import Exchanged, split, without_next
+from torchrl_sym.entries import Exchanged, enclosing, split, without_next
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.probing import check_transforms
 from torchrl_sym.representations import Representation
@@ -126,8 +126,10 @@ class Symmetry(nn.Module):
 
         Only ``is_init``, which says where a recurrent network begins anew, is the same for all copies.
         """
+        known = {*self.keys(), *(group for key in self.keys() for group in enclosing(key))}
         keys = [checks.key("keys", key) for key in checks.sequence("keys", keys)]
-        missing = [key for key in keys if key not in self and split(without_next(key))[1] != "is_init"]
+        bare = {key: without_next(key) for key in keys}
+        missing = [key for key in keys if bare[key] not in known and split(bare[key])[1] != "is_init"]
         if any("recurrent_state" in split(key)[1] for key in missing):
             raise KeyError(
                 f"{reader} reads the memory {missing}, which this symmetry does not know; declare it: "
