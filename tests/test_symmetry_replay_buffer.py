@@ -293,7 +293,7 @@ def test_nested_keys():
     sign = pseudoscalar(group)
     keys = {("agents", "observation"): sign * 3, ("agents", "action"): sign, "goal": invariant(group, 2)}
     data = TensorDict(
-        agents=TensorDict(observation=torch.randn(ROWS, 2, 3), action=torch.randn(ROWS, 2, 1)),
+        agents=TensorDict(observation=torch.randn(ROWS, 3), action=torch.randn(ROWS, 1)),
         goal=torch.randn(ROWS, 2),
         batch_size=[ROWS],
     )
