@@ -208,7 +208,7 @@ def test_missing_entries_are_refused():
 
 
 def test_unknown_entries_are_refused():
-    with pytest.raises(KeyError, match="the batch has 'torque', which this symmetry does not know"):
+    with pytest.raises(KeyError, match=r"the batch has \['torque'\], which this symmetry does not know"):
         SymmetryAugment(make_symmetry())(make_batch(8).set("torque", torch.zeros(8, 2)))
 
 

@@ -49,6 +49,13 @@ def test_symmetric_ppo():
     assert "iteration 1" in run("examples/symmetric_ppo.py", "2")
 
 
+def test_memory():
+    tiny = ["--seeds", "1", "--iterations", "2", "--num-envs", "4", "--steps", "5"]
+    output = run("examples/memory.py", *tiny)
+    assert re.search(r"recurrent, seed 0: return -\d.*of mirror images", output)
+    assert re.search(r"with memory -\d[\d.]*, without -\d", output)
+
+
 def test_own_environment_tells_right_from_wrong():
     output = run("examples/own_environment.py")
     assert "the model's symmetry is exact" in output

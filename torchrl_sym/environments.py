@@ -96,3 +96,10 @@ def close(env: EnvBase) -> None:
     """Close an environment, unless it is."""
     if not env.is_closed:
         env.close()
+
+
+def bare(env: EnvBase) -> EnvBase:
+    """The environment inside all transforms."""
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env

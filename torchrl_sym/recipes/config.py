@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from tensordict import NestedKey
 
-from torchrl_sym.checks import flag, one_of, real, sequence, whole
+from torchrl_sym.checks import flag, key, one_of, real, sequence, whole
 
 
 @dataclass(frozen=True)
@@ -91,6 +92,17 @@ class PPOConfig:
     output_scale: float = 1.0
     """Factor on the network's output: the size, in units of the action, of an ordinary action. Legged
     robots have a wide action box and work in a quarter of it."""
+
+    normalize_observations: bool = False
+    """Put a running normaliser that commutes with the group inside actor and critic, updated after every
+    iteration. Off, since the tasks' observations are scaled by constants."""
+    normalize_rewards: bool = False
+    """Divide rewards by the standard deviation of the running discounted return."""
+    actor_keys: tuple[NestedKey, ...] | None = None
+    """Observations that the actor reads; the rest is for the critic, which is not there when a robot acts.
+    None: all that the symmetry declares."""
+    critic_keys: tuple[NestedKey, ...] | None = None
+    """Observations that the critic reads. None: all that the symmetry declares."""
 
     max_log_ratio: float = 20.0
     """Bound of log pi / pi_k for naive augmentation, which overflows without; inf for none."""
@@ -187,6 +199,8 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         return flag(name, value)
     if value is None and kind.endswith("None"):
         return None
+    if kind.startswith("tuple[NestedKey"):
+        return _keys(name, value)
     if kind.startswith("tuple[int"):
         return tuple(whole(name, size, low=1) for size in sequence(name, value, "sizes"))
     if kind.startswith("tuple[float"):
@@ -199,6 +213,18 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     if name in _MAY_BE_INFINITE and isinstance(value, float) and value == math.inf:
         return math.inf
     return real(name, value, **_RANGES.get(name, {"above": 0}))
+
+
+def _keys(name: str, value: Any) -> tuple[NestedKey, ...]:
+    """Keys, of which nested ones may be lists, as in a file of JSON."""
+    keys = [
+        key(name, tuple(each) if isinstance(each, list) else each) for each in sequence(name, value, "keys")
+    ]
+    if not keys:
+        raise ValueError(f"{name}: expected at least one key, got none; None for all")
+    if len(set(keys)) != len(keys):
+        raise ValueError(f"{name}: expected distinct keys, got {value!r}")
+    return tuple(keys)
 
 
 def _device(value: Any) -> str:
