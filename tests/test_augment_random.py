@@ -9,7 +9,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.buffers import MAPPED, drawn_elements, same
 from tests.networks import make_batch, make_symmetry
-from torchrl_sym import SymmetryAugment
+from torchrl_sym import Symmetry, SymmetryAugment
+from torchrl_sym.representations import invariant
 
 every_shape = pytest.mark.parametrize("shape", [(8,), (8, 4)], ids=str)
 
@@ -55,13 +56,16 @@ def with_ids(batch: TensorDictBase, ids: torch.Tensor) -> TensorDictBase:
     [
         recurrent,
         lambda batch: batch.set(("next", "is_init"), torch.zeros(*batch.shape, 1, dtype=torch.bool)),
-        lambda batch: batch.set("_recurrent_state_h", torch.zeros(*batch.shape, 1, 5)),
+        lambda batch: batch.set("recurrent_state_h", torch.zeros(*batch.shape, 5)),
     ],
     ids=["is_init", "next is_init", "memory"],
 )
 def test_a_sequence_is_mapped_by_one_element(mark):
     torch.manual_seed(0)
-    batch, symmetry = mark(make_batch(64, 5)), make_symmetry("K4")
+    batch, declared = mark(make_batch(64, 5)), make_symmetry("K4")
+    entries = {key: declared[key] for key in MAPPED} | {"recurrent_state_h": invariant(declared.group, 5)}
+    found = set(batch.keys())
+    symmetry = Symmetry(declared.group, {key: rho for key, rho in entries.items() if key in found})
     element = drawn_elements(SymmetryAugment(symmetry, elements="random")(batch), batch, symmetry)
     assert (element == element[:, :1]).all()
     assert element[:, 0].unique().tolist() == [0, 1, 2, 3]

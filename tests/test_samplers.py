@@ -230,6 +230,14 @@ def test_a_slice_draws_one_element(slicer, make):
     assert len(found) > 6  # of 16 pairs of elements
 
 
+def test_slices_draw_independently():
+    torch.manual_seed(0)
+    sampler = SliceSampler(slice_len=SLICE)
+    buffer = symmetric(trajectories(12, 12), "K4", sampler=sampler, elements="random", batch_size=1600)
+    element = buffer.sample()["symmetry_id"][::SLICE]
+    assert abs((element.diff() == 0).float().mean() - 0.25) < 0.1  # 0.022 is its standard deviation
+
+
 @every_slicer
 @pytest.mark.parametrize("make", [HOW["orbit"], HOW["buffer"]], ids=["orbit", "buffer"])
 def test_ends_of_slices_are_marked_in_every_copy(slicer, make):

@@ -125,12 +125,23 @@ def test_threads_sample_and_read_at_once():
 
 
 def test_a_sample_that_fails_leaves_nothing_behind():
-    buffer = symmetric(transform=lambda td: td["nothing"] and td if len(td) > DRAWN else td)
-    with pytest.raises(KeyError, match="nothing"):
-        buffer.sample()
-    assert_images(buffer[:DRAWN], "C2", 0)
-    with pytest.raises(RuntimeError, match="rows as they are stored"):
-        buffer.transform[0](rows())
+    broken = []
+
+    def collate(data):
+        if broken:
+            raise OSError("the disk is full")
+        return data
+
+    buffer = symmetric(collate_fn=collate)
+    for read in (buffer.sample, lambda: buffer[4:8]):
+        broken.append(True)
+        with pytest.raises(OSError, match="disk is full"):
+            read()
+        broken.clear()
+        with pytest.raises(RuntimeError, match="rows as they are stored"):
+            buffer.transform[0](rows())
+        assert_images(buffer[: 2 * DRAWN], "C2", 0)
+        assert_orbits(buffer.sample().split(DRAWN))
 
 
 # --- the user's own transforms
@@ -282,7 +293,7 @@ def test_nested_keys():
     sign = pseudoscalar(group)
     keys = {("agents", "observation"): sign * 3, ("agents", "action"): sign, "goal": invariant(group, 2)}
     data = TensorDict(
-        agents=TensorDict(observation=torch.randn(ROWS, 2, 3), action=torch.randn(ROWS, 2, 1)),
+        agents=TensorDict(observation=torch.randn(ROWS, 3), action=torch.randn(ROWS, 1)),
         goal=torch.randn(ROWS, 2),
         batch_size=[ROWS],
     )

@@ -84,6 +84,9 @@ class SymmetryAugment(Transform):
         tensor([ 1.,  1.,  1.,  1., -1., -1., -1., -1.])
     """
 
+    symmetry: Symmetry
+    log_prob_from: ProbabilisticTensorDictSequential | None
+
     @checks.near_names
     def __init__(
         self,
@@ -117,7 +120,7 @@ class SymmetryAugment(Transform):
         """Refuse environments: they have one action per state, so no batch to grow."""
         super().set_container(container)
         refuse_environment(self)
-        if self.__dict__["log_prob_from"] is not None and self.when == "sample":
+        if self.log_prob_from is not None and self.when == "sample":
             raise RuntimeError(
                 "log_prob_from needs the policy that collected the data, which has changed by the time "
                 "a buffer is sampled; use when='extend' in a buffer, or call the transform on its own"
@@ -172,12 +175,11 @@ class SymmetryAugment(Transform):
 
     def _laid_out(self, orbit: TensorDictBase, names: list[str | None]) -> TensorDictBase:
         if self.layout == "stack":
-            out = orbit
             for dim in range(len(names)):  # permute, in steps that torch.compile can follow
-                out = out.transpose(dim, dim + 1)
-            names = [*names, None]
+                orbit = orbit.transpose(dim, dim + 1)
+            out, names = orbit, [*names, None]
         else:
-            out = orbit.flatten(0, 1)
+            out = cast(TensorDictBase, orbit.flatten(0, 1))
         if any(name is not None for name in names):  # flatten drops them; value estimators look for "time"
             out.names = names
         return out
@@ -203,7 +205,7 @@ class SymmetryAugment(Transform):
         return drawn
 
     def _reevaluate(self, batch: TensorDictBase, originals: int) -> None:
-        actor = self.__dict__["log_prob_from"]
+        actor = self.log_prob_from
         if actor is None or len(batch) == originals:
             return
         copies = cast(TensorDictBase, batch[originals:])

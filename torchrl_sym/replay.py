@@ -145,7 +145,7 @@ class SymmetryOrbit(SampleUnit):
 
     def _draw(self, index: Index, storage: Storage, slicers: list[SliceSampler]) -> Tensor:
         """A random element for each row, or for each run of rows that follow each other in the storage."""
-        time, *lanes = index if isinstance(index, tuple) else (index,)
+        time = index[0] if isinstance(index, tuple) else index
         drawn = torch.randint_like(time, self.symmetry.group.order)
         if not slicers:
             return drawn
@@ -155,10 +155,7 @@ class SymmetryOrbit(SampleUnit):
                 "those of a slice need not do with fragmented=True; use elements='all'"
             )
         step = time.diff(prepend=time[:1]) % storage.shape[0]
-        starts = step > 1  # the same row again is padding
-        for lane in lanes:
-            starts = starts | (lane.diff(prepend=lane[:1]) != 0)
-        return same_along(drawn, starts)
+        return same_along(drawn, step > 1)  # the same row again is padding
 
     def _check_pair(self, buffer: ReplayBuffer) -> None:
         transforms = [t for t in buffer.transform.modules() if isinstance(t, _OrbitTransform)]
@@ -279,18 +276,19 @@ class SymmetryReplayBuffer(TensorDictReplayBuffer):
         if any(isinstance(part, SymmetryAugment | _OrbitTransform) for part in parts):
             raise ValueError("transform: expected the user's own, got one that makes copies; leave it out")
 
-        if when == "sample":
-            self._orbit = SymmetryOrbit(symmetry, elements)
-            copies = self._orbit.transform()
-        else:
-            self._orbit = None
-            copies = _StoredCopies(symmetry, elements, self._check_stored)
+        self._orbit = SymmetryOrbit(symmetry, elements) if when == "sample" else None
+        copies = (
+            self._orbit.transform()
+            if self._orbit
+            else _StoredCopies(symmetry, elements, self._check_stored)
+        )
+        transforms: list[Any] = [copies] if transform is None else [copies, transform]
         super().__init__(
             storage=storage,
             sampler=sampler,
             sample_unit=self._orbit,
             batch_size=batch_size,
-            transform=Compose(copies, *([] if transform is None else [transform])),
+            transform=Compose(*transforms),
             **settings,
         )
         if isinstance(self.storage, StorageEnsemble) or isinstance(self.sampler, SamplerEnsemble):
@@ -328,8 +326,9 @@ class SymmetryReplayBuffer(TensorDictReplayBuffer):
         rows = torch.stack(index, -1) if isinstance(index, tuple) else torch.as_tensor(index)
         value = torch.as_tensor(priority, device=rows.device)
         if rows.ndim and value.ndim:
-            if len(value) != len(rows) and value.ndim > self.dim_extend:  # a batch that is being stored
-                value = value.transpose(0, self.dim_extend)
+            time = self.dim_extend or 0
+            if len(value) != len(rows) and value.ndim > time:  # of a batch that is being stored, time first
+                value = value.transpose(0, time)
             value = value.flatten()
         if rows.ndim and value.ndim and len(value) == len(rows):
             rows, place = rows.unique(dim=0, return_inverse=True)
