@@ -80,7 +80,7 @@ def _joined(specs: Sequence[TensorSpec], representation: Representation) -> Boun
 
 def check_box(key: NestedKey, spec: TensorSpec, representation: Representation) -> None:
     """ValueError unless every element maps the box of a bounded spec onto itself."""
-    if not _has_box(spec):
+    if not isinstance(spec, Bounded) or not isinstance(spec.space, ContinuousBox):
         return
     vector = representation.flatten()
     bounds = [

@@ -112,6 +112,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
     """
 
     mirror_coeff: Tensor
+    entropy_coeff: Tensor
+    critic_coeff: Tensor
+    clip_value: Tensor | None
 
     def __init__(
         self,
@@ -306,8 +309,8 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
 
         loss = distance_loss(target, value, loss_function=self.loss_critic_type)
         if self._clips_value:
-            change = value - old
-            bounded = change.clamp(-self.clip_value, self.clip_value)
+            change, bound = value - old, self.clip_value
+            bounded = change.clamp(-bound, bound)  # pyright: ignore[reportOptionalOperand]
             other = distance_loss(target, old + bounded, loss_function=self.loss_critic_type)
             loss = torch.maximum(loss, other)
             clipped = (change.detach() != bounded.detach()).to(value.dtype)

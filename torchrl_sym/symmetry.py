@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from tensordict import NestedKey, TensorDictBase, is_leaf_nontensor, is_tensor_collection
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from torchrl_sym import checks
@@ -317,7 +318,7 @@ class Symmetry(nn.Module):
         counters = counter_names(env)
         unknown: list[NestedKey] = []
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
-            leaves = dict(specs.items(include_nested=True, leaves_only=True))
+            leaves: dict[NestedKey, TensorSpec] = dict(specs.items(True, True))  # pyright: ignore[reportAssignmentType]
             unknown += [key for key in leaves if key not in self and split(key)[1] not in counters]
             for names, representation in self._declaration.parts:
                 if any(name in leaves for name in names):
