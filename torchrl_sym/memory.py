@@ -312,6 +312,6 @@ def _changes(batch: TensorDictBase) -> list[Tensor]:
 
 def _require(condition: Tensor, message: str) -> None:
     if condition.device.type != "cpu" or torch.compiler.is_compiling():
-        torch._assert_async(condition, message)
+        torch._assert_async(condition, message)  # pyright: ignore[reportPrivateImportUsage]
     elif not condition:
         raise ValueError(message)

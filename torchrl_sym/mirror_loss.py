@@ -246,7 +246,7 @@ class MirrorLoss(LossModule):
         return HeldNetwork(network, self.actor_network_params)
 
     def _borrow(self, inside: HeldNetwork) -> HeldNetwork:
-        self.__dict__["actor_network"] = inside.module  # not registered: its parameters are another's
+        vars(self)["actor_network"] = inside.module  # not registered: its parameters are another's
         known = self._AcceptedKeys.__dataclass_fields__
         self.set_keys(**{name: key for name, key in inside.keys.items() if name in known})
         return inside

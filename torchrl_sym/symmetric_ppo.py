@@ -308,9 +308,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         target, value, old = self._critic_loss_inputs(target, value, old)
 
         loss = distance_loss(target, value, loss_function=self.loss_critic_type)
-        if self._clips_value:
-            change, bound = value - old, self.clip_value
-            bounded = change.clamp(-bound, bound)  # pyright: ignore[reportOptionalOperand]
+        if old is not None and self.clip_value is not None and self._clips_value:
+            change = value - old
+            bounded = change.clamp(-self.clip_value, self.clip_value)
             other = distance_loss(target, old + bounded, loss_function=self.loss_critic_type)
             loss = torch.maximum(loss, other)
             clipped = (change.detach() != bounded.detach()).to(value.dtype)
