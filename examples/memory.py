@@ -136,8 +136,13 @@ def train(arguments: Arguments, recurrent: bool, seed: int) -> float:
         batch_size=envs // 4,
     )
     frames = envs * steps
-    settings = {"frames_per_batch": frames, "total_frames": frames * arguments.iterations}
-    collector = Collector(env, actor, **settings, reset_at_each_iter=True)  # memory
+    collector = Collector(
+        env,
+        actor,
+        frames_per_batch=frames,
+        total_frames=frames * arguments.iterations,
+        reset_at_each_iter=True,  # memory
+    )
     returns: list[float] = []
     kl = kl_mirrored = 0.0
     for data in collector:
@@ -151,7 +156,7 @@ def train(arguments: Arguments, recurrent: bool, seed: int) -> float:
                 (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
                 nn.utils.clip_grad_norm_(parameters, 1.0)
                 optimizer.step()
-        kl, kl_mirrored = out["kl_approx_sym"].tolist()
+                kl, kl_mirrored = out["kl_approx_sym"].tolist()
         returns.append(float(data["next", "reward"].sum(1).mean()))
     collector.shutdown()
     name = "recurrent" if recurrent else "feed-forward"

@@ -131,13 +131,6 @@ class Symmetry(nn.Module):
         keys = [checks.key("keys", key) for key in checks.sequence("keys", keys)]
         bare = {key: without_next(key) for key in keys}
         missing = [key for key in keys if bare[key] not in known and split(bare[key])[1] != "is_init"]
-        if any("recurrent_state" in split(key)[1] for key in missing):
-            raise KeyError(
-                f"{reader} reads the memory {missing}, which this symmetry does not know; declare it: "
-                "invariant(group, d) for an ordinary LSTM or GRU, whose copies then begin from zero memory "
-                "(sample slices that begin where is_init is set, or give the loss a burn_in), or its "
-                "representation if the network is equivariant"
-            )
         if missing:
             reserved = [key for key in missing if split(key)[1] in _INVARIANT]
             hint = f" (copies share TorchRL's {reserved}, but not with a network that reads them)"
