@@ -68,7 +68,8 @@ def inside(env: EnvBase) -> Iterator[list[EnvBase]]:
         elif isinstance(env, ParallelEnv | AsyncEnvPool):
             makers = env.create_env_fn if isinstance(env, ParallelEnv) else env.env_makers
             found = []
-            for maker, kwargs in {m: k for m, k in zip(makers, env.create_env_kwargs, strict=True)}.items():
+            pairs = zip(makers, env.create_env_kwargs, strict=True)
+            for maker, kwargs in {id(maker): (maker, kwargs) for maker, kwargs in pairs}.values():
                 if isinstance(maker, EnvBase):
                     found.append(maker)
                     continue

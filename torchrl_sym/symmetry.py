@@ -279,8 +279,8 @@ class Symmetry(nn.Module):
 
         Raises:
             KeyError: an observation or action of the environment is not declared (strict).
-            ValueError: a size differs, a box is not symmetric, or a running normaliser, which L_g does
-                not commute with, is applied to a declared observation.
+            ValueError: a size differs, a box is not symmetric, or a transform, such as a normaliser, does
+                not commute with L_g or K_g.
         """
         checks.instance("env", env, EnvBase)
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):

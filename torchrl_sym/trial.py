@@ -75,7 +75,7 @@ class Trial:
         halves = (torch.float16, torch.bfloat16)
         self.is_single = not any(s.dtype in halves for each in layouts for s in each.specs.values())
 
-        torch.manual_seed(0)
+        torch.default_generator.manual_seed(0)  # not CUDA's, which it might initialise
         self.plain, other = self._draw(1.0), self._draw(1.0)
         self.state = copies(transforms, env)
         # statistics that nobody would call symmetric, the same for all rows
@@ -99,7 +99,7 @@ class Trial:
         raw, sent = sources.split([self.raw.dim, self.sent.dim], -1)
         observations = [self.raw.cast(each) for each in raw]
         actions = [self.sent.cast(each) for each in sent[1:]]
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)
         after, received = play(transforms, self.env.base_env, observations, actions)
         return torch.cat([self.seen.flatten(after), self.taken.flatten(received)], -1)
 
