@@ -83,8 +83,9 @@ class Trial:
         self._play(self.state, (1 + 2 * row.abs()).expand_as(self.plain), 0)
         for transform in self.state:
             transform.eval()
-            if hasattr(transform, "freeze"):
-                transform.freeze()
+            freeze = getattr(transform, "freeze", None)
+            if callable(freeze):
+                freeze()
 
         self.result = self(self.plain)
         self.present = ~_anywhere(self.result.isnan())
