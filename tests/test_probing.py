@@ -193,7 +193,6 @@ for kind in RUNNING:
     WRONG |= {
         name: (name, lambda kind=kind: robot(kind(["observation"]))),
         f"{name}, cat": (name, lambda kind=kind: apart(kind(["velocity", "knees"]), cat())),
-        f"cat, {name}": (name, lambda kind=kind: apart(cat(), kind(["observation"]))),
         f"cat, {name}, rename": (name, lambda kind=kind: renamed(kind(["raw"]))),
     }
 
@@ -242,6 +241,10 @@ def test_entries_are_followed_to_another_order():
     moved.check_specs(robot(Plain(lambda x: x[..., order])))
     with pytest.raises(ValueError, match="ObservationNorm does not commute"):
         moved.check_specs(robot(norm([0, 0.1, 0, 0, 0]), Plain(lambda x: x[..., order])))
+
+
+def test_results_that_are_no_numbers_agree_with_one_another():
+    SYMMETRY.check_specs(robot(Plain(lambda x: (20 - x.abs()).sqrt() * x.sign())))
 
 
 def test_groups_that_mix_entries():

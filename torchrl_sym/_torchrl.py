@@ -27,7 +27,8 @@ def serial_workers(env: SerialEnv) -> list[EnvBase]:
     """The environments of a SerialEnv, one of each maker; they are made now, if they were not before."""
     if env.is_closed:
         env.start()
-    return list(dict(zip(env.create_env_fn, env._envs, strict=True)).values())
+    makers = [id(maker) for maker in env.create_env_fn]
+    return list(dict(zip(makers, env._envs, strict=True)).values())
 
 
 def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer]:

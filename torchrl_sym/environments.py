@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import numpy as np
 import torch
@@ -49,7 +50,7 @@ def shell(env: EnvBase) -> list[Transform]:
     return _flat(env.transform) if isinstance(env, TransformedEnv) else []
 
 
-def _flat(transform: Transform | None) -> list[Transform]:
+def _flat(transform: Any) -> list[Transform]:
     if isinstance(transform, Compose):
         return [leaf for each in transform.transforms for leaf in _flat(each)]
     return [] if transform is None else [transform]
@@ -68,7 +69,8 @@ def inside(env: EnvBase) -> Iterator[list[EnvBase]]:
         elif isinstance(env, ParallelEnv | AsyncEnvPool):
             makers = env.create_env_fn if isinstance(env, ParallelEnv) else env.env_makers
             found = []
-            for maker, kwargs in {m: k for m, k in zip(makers, env.create_env_kwargs, strict=True)}.items():
+            pairs = zip(makers, env.create_env_kwargs, strict=True)
+            for maker, kwargs in {id(maker): (maker, kwargs) for maker, kwargs in pairs}.values():
                 if isinstance(maker, EnvBase):
                     found.append(maker)
                     continue

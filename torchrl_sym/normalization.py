@@ -219,4 +219,5 @@ def _event_shape(representation: Representation) -> torch.Size:
 
 
 def _flat(representation: Representation) -> Representation:
-    return representation.flatten() if hasattr(representation, "flatten") else representation
+    flatten = getattr(representation, "flatten", None)
+    return representation if flatten is None else flatten()

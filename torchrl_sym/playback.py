@@ -148,7 +148,8 @@ def copies(transforms: Sequence[Transform], env: EnvBase) -> list[Transform]:
     known: dict[int, Any] = {id(owner): None for owner in (*owners, env, bare(env)) if owner is not None}
     for tensor in (x for t in transforms for x in (*t.buffers(), *t.parameters())):
         if is_lazy(tensor):  # not yet of any size, which deepcopy refuses
-            known[id(tensor)] = type(tensor)(device=tensor.device, dtype=tensor.dtype)
+            kind: Any = type(tensor)
+            known[id(tensor)] = kind(device=tensor.device, dtype=tensor.dtype)
     copied = [copy.deepcopy(t, dict(known)) for t in transforms]
     for part in (m for t in copied for m in t.modules() if isinstance(m, Transform)):
         part.reset_parent()
@@ -172,7 +173,7 @@ def play(
     played = Played(env, observations)
     with warnings.catch_warnings(), torch.no_grad():
         warnings.simplefilter("ignore")  # they were given when the environment was made
-        around = TransformedEnv(played, Compose(*transforms))
+        around = TransformedEnv(played, Compose(*transforms))  # pyright: ignore[reportArgumentType]
         td = after = around.reset()
         for action in actions:
             stepped = around.step(td.update(action))

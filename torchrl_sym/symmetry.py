@@ -304,8 +304,8 @@ class Symmetry(nn.Module):
         Raises:
             KeyError: observations or actions of the environment are not declared (strict), but for those
                 that TorchRL's counters (StepCounter, RewardSum, InitTracker) write.
-            ValueError: a size differs, a box is not symmetric, or a normaliser that L_g does not commute
-                with is applied to a declared observation.
+            ValueError: a size differs, a box is not symmetric, or a transform, such as a normaliser, does
+                not commute with L_g or K_g.
         """
         checks.instance("env", env, EnvBase)
         counters = counter_names(env)

@@ -75,7 +75,7 @@ class Trial:
         halves = (torch.float16, torch.bfloat16)
         self.is_single = not any(s.dtype in halves for each in layouts for s in each.specs.values())
 
-        torch.manual_seed(0)
+        torch.default_generator.manual_seed(0)  # not CUDA's, which it might initialise
         self.plain, other = self._draw(1.0), self._draw(1.0)
         self.state = copies(transforms, env)
         # statistics that nobody would call symmetric, the same for all rows
@@ -83,11 +83,12 @@ class Trial:
         self._play(self.state, (1 + 2 * row.abs()).expand_as(self.plain), 0)
         for transform in self.state:
             transform.eval()
-            if hasattr(transform, "freeze"):
-                transform.freeze()
+            freeze = getattr(transform, "freeze", None)
+            if callable(freeze):
+                freeze()
 
         self.result = self(self.plain)
-        self.present = ~self._anywhere(self.result.isnan())
+        self.present = ~_anywhere(self.result.isnan())
         self.is_random = bool((self._differs(self(self.plain, seed=1)) & self.present).any())
         self._find_sources(other)
 
@@ -99,18 +100,15 @@ class Trial:
         raw, sent = sources.split([self.raw.dim, self.sent.dim], -1)
         observations = [self.raw.cast(each) for each in raw]
         actions = [self.sent.cast(each) for each in sent[1:]]
-        torch.manual_seed(seed)
+        torch.default_generator.manual_seed(seed)
         after, received = play(transforms, self.env.base_env, observations, actions)
         return torch.cat([self.seen.flatten(after), self.taken.flatten(received)], -1)
 
     def _draw(self, size: float) -> Tensor:
         return torch.cat([self.raw.draw(_STEPS, size), self.sent.draw(_STEPS, size)], -1)
 
-    def _anywhere(self, flags: Tensor) -> Tensor:
-        return flags.reshape(-1, flags.shape[-1]).any(0)
-
     def _differs(self, result: Tensor) -> Tensor:
-        return self._anywhere((result != self.result) & ~result.isnan())
+        return _anywhere((result != self.result) & ~result.isnan())
 
     def _find_sources(self, other: Tensor) -> None:
         """Number the sources; change those whose number has a one at a bit, then those that have a zero."""
@@ -133,9 +131,8 @@ class Trial:
         self.arrived = _Links(source[size:] - self.raw.dim, arrives, self.sent.dim)
 
         self.direct = [key for key in self.raw.events if self._is_direct(key)]
-        self.covered = (
-            self.observed.has_result | sent | torch.cat([self.raw.mask(self.direct), self.sent.mask([])])
-        )
+        direct = torch.cat([self.raw.mask(self.direct), self.sent.mask([])])
+        self.covered = self.observed.has_result | sent | direct
         unknown = self._differs(self(torch.where(self.covered, self.plain, other)))
         self.judged = torch.cat([known & ~unknown[:size], arrives]) & self.present
         self.undecided = bool((known & ~self.judged[:size]).any())
@@ -145,7 +142,7 @@ class Trial:
         while True:
             others = torch.randn(len(followed), dtype=torch.float64) * ~followed
             images = torch.stack([self._outside(others, g) for g in range(len(self.declared.names))])
-            reached = followed & self._anywhere(images != 0)
+            reached = followed & _anywhere(images != 0)
             if not reached.any():
                 return followed
             followed = followed & ~reached
@@ -197,9 +194,12 @@ class Trial:
 
     def _close(self, got: Tensor, wanted: Tensor) -> Tensor:
         """Which results agree, to four digits of their size, ``(results,)``."""
-        size = torch.maximum(got.abs(), wanted.abs()).reshape(-1, got.shape[-1]).amax(0)
-        tolerance = 1e-4 if self.is_single else 3e-2
-        return (got - wanted).abs().reshape(-1, got.shape[-1]).amax(0) <= tolerance * size + 1e-6
+        size = torch.maximum(got.abs(), wanted.abs()).nan_to_num(0.0, 0.0)
+        size = size.reshape(-1, got.shape[-1]).amax(0)
+        relative, rounding = (1e-4, 3e-6) if self.is_single else (3e-2, 1e-2)
+        bound = relative * size + rounding * (size * self.judged).amax() + 1e-6
+        same = ((got - wanted).abs() <= bound) | (got == wanted) | got.isnan()
+        return same.reshape(-1, got.shape[-1]).all(0)
 
     def _described(self, got: Tensor, wanted: Tensor, wrong: Tensor, name: str) -> str:
         difference = torch.where(wrong, (got - wanted).abs(), 0.0).reshape(-1, len(wrong))
@@ -214,26 +214,24 @@ class Trial:
     @property
     def inside(self) -> Declared:
         """What is known of the environment inside."""
-        raw = self.covered[: self.raw.dim]
-        keys = [key for key in self.raw.events if bool(raw[self.raw.mask([key])].all())]
-        keys += [
-            key for key in self.taken.events if bool(self.arrived.chosen[self.taken.mask([key])].all())
-        ]
+        sides = ((self.raw, self.covered[: self.raw.dim]), (self.taken, self.arrived.chosen))
+        keys = [key for side, known in sides for key in side.events if known[side.mask([key])].all()]
         return Declared(keys, self._image_inside, self.declared.names)
 
     def _image_inside(self, td: TensorDictBase, g: int) -> TensorDictBase:
         out = td.copy()
-        rows = torch.cat(
-            [self.raw.flatten(td), torch.zeros(*td.batch_size, self.sent.dim)], -1
-        ).nan_to_num()
-        for layout, image in (
-            (self.raw, self._inside(rows, g)),
-            (self.taken, self._taken(self.taken.flatten(td), g)),
-        ):
+        sources = torch.cat([self.raw.flatten(td), torch.zeros(*td.batch_size, self.sent.dim)], -1)
+        raw = self._inside(sources.nan_to_num(), g)
+        taken = self._taken(self.taken.flatten(td), g)
+        for layout, image in ((self.raw, raw), (self.taken, taken)):
             for key, value in layout.split(image).items(True, True):
                 if key in td.keys(True, True):
                     out.set(key, value)
         return out
+
+
+def _anywhere(flags: Tensor) -> Tensor:
+    return flags.reshape(-1, flags.shape[-1]).any(0)
 
 
 class _Links:

@@ -56,6 +56,9 @@ class SymmetricVecNorm(VecNormV2):
     """
 
     is_symmetric = True
+    _loc: Any  # tensordicts, once there are data
+    _var: Any
+    _count: Any
 
     def __init__(
         self,
@@ -124,7 +127,7 @@ class SymmetricVecNorm(VecNormV2):
                 weight = math.expm1(len(rows) * log) / torch.expm1(total * log)
             else:
                 weight = len(rows) / total
-            average.merge(loc, var, rows, weight.to(loc))
+            average.merge(loc, var, rows, weight.to(loc))  # pyright: ignore[reportCallIssue]
 
     def _norm(
         self, data: TensorDictBase, loc: TensorDictBase, var: TensorDictBase, count: TensorDictBase

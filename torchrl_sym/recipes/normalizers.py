@@ -71,8 +71,7 @@ class RewardScale(nn.Module):
             self.running.copy_(returns[-1].masked_fill(done, 0.0))
         self._add(torch.stack(returns))
 
-        scaled = data.copy()
-        scaled["next"] = data["next"].copy()
+        scaled = data.copy()  # with another "next", of the same tensors
         scaled["next", "reward"] = reward / self.var.sqrt().clamp(min=_LEAST_STD).to(reward)
         return scaled
 
