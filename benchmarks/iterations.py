@@ -26,12 +26,10 @@ from torchrl_sym.recipes.networks import make_networks
 TASKS = ("cartpole", "anymal_push", "anymal_climb")
 
 
-def measure_iterations(names: tuple[str, ...], rounds: int) -> list[dict]:
+def measure_iterations(names: tuple[str, ...], rounds: int) -> Iterator[dict]:
     """Milliseconds of an update and of an iteration, and ratios to rsl_rl's."""
-    return [
-        {"task": task, "augmentation": augmentation, **compare(config, make_env, rounds)}
-        for task, augmentation, config, make_env in cases(names)
-    ]
+    for task, augmentation, config, make_env in cases(names):
+        yield {"task": task, "augmentation": augmentation, **compare(config, make_env, rounds)}
 
 
 def compare(config: PPOConfig, make_env: Callable, rounds: int) -> dict[str, float | None]:
@@ -71,22 +69,20 @@ def our_update(config: PPOConfig, make_env: Callable) -> Callable[[], object]:
     return functools.partial(learner.fit, learner.estimate(data))
 
 
-def measure_options(names: tuple[str, ...], rounds: int) -> list[dict]:
+def measure_options(names: tuple[str, ...], rounds: int) -> Iterator[dict]:
     """Processor time of all epochs with an option, over that without."""
     choices = {
         "compile": {"compile": True},
         "bfloat16": {"autocast": "bfloat16"},
         "both": {"compile": True, "autocast": "bfloat16"},
     }
-    rows = []
     for task, augmentation, config, make_env in cases(names):
         variants = {"default": our_update(config, make_env)}
         for name, options in choices.items():
             variants[name] = our_update(dataclasses.replace(config, **options), make_env)
         seconds = interleave(variants, rounds, time.process_time)
         ratios = {name: ratio(seconds, name, "default") for name in choices}
-        rows.append({"task": task, "augmentation": augmentation, **ratios})
-    return rows
+        yield {"task": task, "augmentation": augmentation, **ratios}
 
 
 def cases(names: tuple[str, ...]) -> Iterator[tuple[str, str, PPOConfig, Callable]]:

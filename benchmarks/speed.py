@@ -331,9 +331,10 @@ def measure_augmentation(arguments: Arguments) -> list[dict]:
 def measure_training(arguments: Arguments, measure: Callable) -> list[dict]:
     """A table of iterations.py."""
     print(f"\n{measure.__doc__}")
-    table = measure(arguments.tasks, arguments.rounds)
-    for number in range(len(table)):
-        show(table[: number + 1])
+    table = []
+    for row in measure(arguments.tasks, arguments.rounds):
+        table.append(row)
+        show(table)
     return table
 
 
