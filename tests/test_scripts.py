@@ -161,12 +161,13 @@ def test_what_policies_do_is_drawn_from_the_stored_ones(tmp_path, name, task, ki
 @pytest.mark.slow
 def test_speed_writes_its_figures(tmp_path):
     figures = tmp_path / "speed.json"
-    tiny = ["--tasks", "anymal_push", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
+    tiny = ["--tasks", "cartpole", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
     run("benchmarks/speed.py", *tiny, "--output", figures)
     results = json.loads(figures.read_text())
     assert results["env"][0]["env_over_raw"] > 0
     assert {row["order"] for row in results["loss"]} == {1, 2, 4}
     assert {row["elements"] for row in results["augment"]} == {"all", "random"}
+    assert {row["augmentation"] for row in results["iteration"]} == {"none", "all"}
 
 
 @pytest.mark.parametrize("number", range(3))

@@ -72,14 +72,20 @@ class Learner:
         Raises:
             FloatingPointError: a loss or its gradient is not finite; the parameters are those before it.
         """
+        return self.fit(self.estimate(data))
+
+    @torch.no_grad()
+    def estimate(self, data: TensorDictBase) -> TensorDictBase:
+        """The rows to learn from, with their advantages and value targets."""
         if self.naive is not None:
             data = self.naive(data)  # before GAE: also the advantage is that of the copies
-        with torch.no_grad():
-            estimate_values(self.critic, data)
-            self.gae(data)
-        rows = data.select(*self._keys()).reshape(-1)
-        size = len(rows) // self.config.minibatches
+        estimate_values(self.critic, data)
+        self.gae(data)
+        return data.select(*self._keys()).reshape(-1)
 
+    def fit(self, rows: TensorDictBase) -> dict[str, float]:
+        """Some epochs of minibatch updates on rows of :meth:`estimate`; returns what :meth:`learn` does."""
+        size = len(rows) // self.config.minibatches
         reports: list[dict[str, Tensor]] = []
         for _ in range(self.config.epochs):
             shuffled = rows[torch.randperm(len(rows), device=rows.device)]
