@@ -300,10 +300,12 @@ def _as_sequences(batch: TensorDictBase) -> TensorDictBase:
 def _changes(batch: TensorDictBase) -> list[Tensor]:
     """What tells that the next step is of another trajectory, each ``[*B, T - 1]``."""
     found = []
-    trajectory, done = (batch.get(key, None) for key in (("collector", "traj_ids"), ("next", "done")))
-    if trajectory is not None:
-        trajectory = _per_step(trajectory, batch)[..., 0]
-        found.append(trajectory[..., 1:] != trajectory[..., :-1])
+    for key in (("collector", "traj_ids"), "env_index"):  # AsyncBatchedCollector writes the latter
+        origin = batch.get(key, None)
+        if origin is not None:
+            origin = _per_step(origin, batch)[..., 0]
+            found.append(origin[..., 1:] != origin[..., :-1])
+    done = batch.get(("next", "done"), None)
     if done is not None:
         done = _per_step(done, batch).all(-1)
         found.append(done[..., :-1] & ~done[..., 1:])  # the last one of several, as multi-step returns have

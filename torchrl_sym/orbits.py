@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
 from torch import Tensor
 
 from torchrl_sym.memory import Memory
@@ -48,6 +48,8 @@ class Copies:
         memory: Memory,
         mask_keys: Iterable[NestedKey] = (),
     ) -> None:
+        if isinstance(originals, LazyStackedTensorDict):
+            originals = originals.contiguous()  # TorchRL's losses read no log-probability from lazy stacks
         self.td = originals
         self.mask_keys = list(mask_keys)
         if elements is None:
