@@ -51,11 +51,7 @@ from ant.training import Setting, train, write
 from torchrl_sym.recipes.workers import end_with_parent
 
 ROOT = Path(__file__).parents[1]
-SETTINGS = [
-    Setting(algorithm, arm, actor_rate=rate)
-    for algorithm, rate in {"sac": 5e-4, "td3": 1e-4}.items()  # TD3's actor saturates if it is faster
-    for arm in ("plain", "symmetric")
-]
+SETTINGS = [Setting(algorithm, arm) for algorithm in ("sac", "td3") for arm in ("plain", "symmetric")]
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "mujoco")
 
 

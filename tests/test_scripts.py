@@ -49,6 +49,12 @@ def test_symmetric_ppo():
     assert "iteration 1" in run("examples/symmetric_ppo.py", "2")
 
 
+@pytest.mark.parametrize("script", ["examples/sac.py", "examples/td3.py"])
+def test_off_policy_examples(script):
+    output = run(script, "500")
+    assert re.search(r"500 steps: return -?[\d.]+, mirror error [\d.]+", output)
+
+
 def test_own_environment_tells_right_from_wrong():
     output = run("examples/own_environment.py")
     assert "the model's symmetry is exact" in output

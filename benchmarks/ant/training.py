@@ -64,6 +64,8 @@ class Setting:
     """SAC's temperature."""
     noise: float = 0.3
     """Deviation of what TD3 adds to its actions to explore."""
+    effort: float = 0.1
+    """Weight of a penalty on what TD3's actor feeds its tanh, squared, without which actions saturate."""
     delay: int = 2
     """TD3's gradient steps of the critics per step of the actor."""
     evaluations: int = 10
@@ -149,12 +151,18 @@ class Learner:
         else:
             total = self.loss.value_loss(batch)[0]
             if self.steps % self.setting.delay == 0:
-                total = total + self.loss.actor_loss(batch)[0]
+                total = total + self.loss.actor_loss(batch)[0] + self.effort(batch["observation"])
         # a mean over seeds, whose gradients Adam takes for what they are at any scale
         total.backward()
         self.optimizer.step()
         self.optimizer.zero_grad()
         self.target.step()
+
+    def effort(self, observation: Tensor) -> Tensor:
+        """TD3's penalty. Once a tanh is saturated, no gradient of the critic leads out of it."""
+        body = self.loss.actor_network.module
+        with self.loss.actor_network_params.to_module(self.loss.actor_network):
+            return self.setting.effort * body[0](observation).square().mean()
 
 
 def train(setting: Setting) -> Iterator[list[dict[str, float]]]:
