@@ -56,6 +56,12 @@ def test_memory():
     assert re.search(r"with memory -\d[\d.]*, without -\d", output)
 
 
+@pytest.mark.parametrize("script", ["examples/sac.py", "examples/td3.py"])
+def test_off_policy_examples(script):
+    output = run(script, "500")
+    assert re.search(r"500 steps: return -?[\d.]+, mirror error [\d.]+", output)
+
+
 def test_own_environment_tells_right_from_wrong():
     output = run("examples/own_environment.py")
     assert "the model's symmetry is exact" in output
