@@ -44,6 +44,18 @@ def test_wrapped_environments_train_and_continue_with_a_warning(make_env, tmp_pa
     assert [row["iteration"] for row in rest] == [3]
 
 
+def test_a_maker_that_ignores_its_seed_can_be_repeated():
+    def ignoring(*, num_envs, seed):
+        return SerialEnv(num_envs, lambda: DMControlEnv("pendulum", "swingup", from_pixels=False))
+
+    group = PointGroup.reflection("y")
+    sign = pseudoscalar(group)
+    entries = {"orientation": scalar(group) + sign, "velocity": sign, "action": sign}
+    config = dataclasses.replace(TINY, num_envs=2)
+    runs = [list(train(config, ignoring, Symmetry(group, entries)))[-1]["log_prob"] for _ in range(2)]
+    assert runs[0] == runs[1]
+
+
 @pytest.mark.parametrize(("make_env", "restored"), [(TASK, True), (transformed, True), (serial, False)])
 def test_returns_of_running_episodes_continue_if_the_episodes_do(make_env, restored, tmp_path):
     symmetry, run = TASK(num_envs=1, seed=0).symmetry, RunFolder(tmp_path)

@@ -8,6 +8,7 @@ workers.
 from __future__ import annotations
 
 import numbers
+import warnings
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from torchrl.envs import EnvBase
@@ -70,6 +71,24 @@ def offered(env: EnvBase, offer: type[Offer]) -> Offer | None:
     """The environment inside all transforms, if its class has an offer."""
     base = bare(env)
     return base if issubclass(type(base), offer) else None  # pyright: ignore[reportReturnType]
+
+
+def seed_unless_own(env: EnvBase, seed: int) -> None:
+    """Seed an environment, whose maker may not have; those that save their own state have been made with it.
+
+    With a maker that ignores its seed, no run could be repeated, and several seeds would mean nothing.
+    """
+    if offered(env, Resumable) is not None:
+        return
+    try:
+        env.set_seed(seed)
+    except NotImplementedError:
+        warnings.warn(
+            f"{type(bare(env)).__name__} cannot be seeded (set_seed is not implemented), so that this run "
+            "cannot be repeated; implement _set_seed, or give make_env an environment that has it",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def measure(env: EnvBase) -> dict[str, float]:

@@ -5,7 +5,6 @@ Read :meth:`_Run.iterations` from top to bottom; everything before it prepares, 
 
 from __future__ import annotations
 
-import copy
 import os
 import time
 import warnings
@@ -26,7 +25,7 @@ from torchrl_sym.recipes.checkpoint import (
     warn_unless_exact,
 )
 from torchrl_sym.recipes.config import PPOConfig
-from torchrl_sym.recipes.environment import MakeEnv, Staggered, measure, offered
+from torchrl_sym.recipes.environment import MakeEnv, Staggered, measure, offered, seed_unless_own
 from torchrl_sym.recipes.learner import Learner
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_networks
@@ -107,7 +106,8 @@ def train(
 
     Args:
         config: hyper-parameters.
-        make_env: called with ``num_envs`` and ``seed``.
+        make_env: called with ``num_envs`` and ``seed``. An environment that cannot save its state is seeded
+            once more, in case it ignores the latter.
         symmetry: what transforms how. Its observation keys are what actor and critic read, unless
             ``config`` says which of them. Also used, as a metric, when nothing is augmented.
         folder: where metrics and checkpoints go; nothing is written by default. One process at a time can
@@ -176,8 +176,9 @@ class _Run:
         torch.manual_seed(config.seed)
         self.env = make_env(num_envs=config.num_envs, seed=config.seed)
         try:
+            seed_unless_own(self.env, config.seed)
             symmetry.check_specs(self.env)
-            self.symmetry = copy.deepcopy(symmetry).to(config.device)
+            self.symmetry = symmetry
             actor, critic = make_networks(config, self.env, self.symmetry)
             self.learner = Learner(config, actor, critic, self.symmetry)
             self.rewards = None
