@@ -126,7 +126,7 @@ def make_actor(
     bounds = (config.min_std, config.max_std)
     policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
-        KeyedModule(policy, in_keys, ["loc", "scale"]),
+        KeyedModule(policy, list(in_keys), ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
@@ -135,7 +135,7 @@ def make_actor(
 
 def make_critic(config: PPOConfig, in_keys: Sequence[NestedKey], in_size: int) -> KeyedModule:
     """State value on the concatenated inputs."""
-    return KeyedModule(FeedForward(in_size, 1, config.hidden), in_keys, ["state_value"])
+    return KeyedModule(FeedForward(in_size, 1, config.hidden), list(in_keys), ["state_value"])
 
 
 def make_networks(
