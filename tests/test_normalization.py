@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from torchrl_sym import PointGroup, Representation, representations
-from torchrl_sym.normalization import SymmetricNorm, components
+from torchrl_sym.normalization import SymmetricNorm
 from torchrl_sym.representations import (
     axial,
     heading,
@@ -93,8 +93,8 @@ def test_statistics_are_those_of_the_augmented_data(group, builder):
     variance = orbit.var(0, correction=0)
     if rep.is_signed_permutation:
         torch.testing.assert_close(norm.var, variance)
-    for label in components(rep).unique():  # of mixed entries, the mean of their variances
-        members = components(rep) == label
+    for label in rep.components.unique():  # of mixed entries, the mean of their variances
+        members = rep.components == label
         torch.testing.assert_close(norm.var[members], variance[members].mean().expand(int(members.sum())))
 
 
@@ -108,8 +108,8 @@ def test_without_a_group_it_is_plain_normalisation():
 
 def test_components_of_mixed_and_exchanged_entries():
     turn, flip = PointGroup.rotation(3), PointGroup.reflection("y")
-    assert components(polar(turn) + scalar(turn) * 2).tolist() == [0, 0, 1, 2, 3]
-    assert components(polar(flip)).tolist() == [0, 1, 2]  # changing sign mixes nothing
+    assert (polar(turn) + scalar(turn) * 2).components.tolist() == [0, 0, 1, 2, 3]
+    assert polar(flip).components.tolist() == [0, 1, 2]  # changing sign mixes nothing
     assert len(components(ring(flip)).unique()) == 7  # five pairs, and two points on the plane
     assert len(components(wrenches(PointGroup.rotation(4))).unique()) == 9  # 6 of (x, y), 3 of z
 
@@ -148,7 +148,6 @@ def test_several_inputs_are_normalised_by_their_own_statistics():
         norm.update(inputs[1], inputs[0], inputs[2])
 
 
-@pytest.mark.skipif(not hasattr(representations, "items"), reason="one event dimension only")
 def test_items_of_several_event_dimensions():
     group = GROUPS["C3"]
     rep = representations.items(ring(group), polar(group))  # (12, 3)

@@ -17,7 +17,6 @@ variance of the augmented data; of entries that it mixes, v is the mean of their
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -26,7 +25,6 @@ from torch import Tensor, nn
 
 from torchrl_sym import checks
 from torchrl_sym.representations import Representation
-from torchrl_sym.representations.blocks import Block, SignedPermutation
 
 
 class GroupAverage(nn.Module):
@@ -41,8 +39,8 @@ class GroupAverage(nn.Module):
 
     def __init__(self, representation: Representation | None) -> None:
         super().__init__()
-        self.representation = copy.deepcopy(representation)  # moved with this module, not with its owner
-        labels = torch.zeros(0, dtype=torch.int64) if representation is None else components(representation)
+        self.representation = representation
+        labels = torch.zeros(0, dtype=torch.int64) if representation is None else representation.components.clone()
         self.register_buffer("labels", labels, persistent=False)
         self.register_buffer("sizes", labels.bincount(), persistent=False)
 
@@ -70,29 +68,6 @@ class GroupAverage(nn.Module):
         step = new_mean - mean
         mean.add_(weight * step)
         variance.add_(weight * self.pool(step**2)).mul_(1 - weight).add_(weight * new_variance)
-
-
-def components(representation: Representation) -> Tensor:
-    """Labels ``(dim,)`` of the entries: those that some element exchanges or mixes have the same."""
-    known = getattr(representation, "components", None)
-    if known is not None:
-        return known.clone()
-    labels: list[Tensor] = []
-    for block in representation.blocks:
-        start = int(labels[-1].max()) + 1 if labels else 0
-        labels.append(start + _block_components(block))
-    return torch.cat(labels)
-
-
-def _block_components(block: Block) -> Tensor:
-    if isinstance(block, SignedPermutation):
-        least = block.index.amin(0).cpu()  # of the places that the elements bring to an entry: its orbit
-    else:
-        linked = (block.matrices.abs() > 1e-9).any(0).cpu()
-        for _ in range(block.dim.bit_length()):  # paths twice as long each time
-            linked = (linked.double() @ linked.double()) > 0
-        least = linked.long().argmax(-1)
-    return least.unique(return_inverse=True)[1]
 
 
 class SymmetricNorm(nn.Module):
@@ -137,12 +112,12 @@ class SymmetricNorm(nn.Module):
         super().__init__()
         if not representations:
             raise ValueError("expected at least one representation, got none")
-        flat = [_flat(checks.instance("representations", rep, Representation)) for rep in representations]
+        flat = [checks.instance("representations", rep, Representation).flatten() for rep in representations]
         self.eps = checks.real("eps", eps, above=0)
         self.until = None if until is None else checks.whole("until", until, 1)
         self.update_in_forward = checks.flag("update_in_forward", update_in_forward)
         self.average = GroupAverage(sum(flat[1:], start=flat[0]))
-        self.shapes = [_event_shape(rep) for rep in representations]
+        self.shapes = [torch.Size(rep.event_shape) for rep in representations]
         size = len(self.average.labels)
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
@@ -212,12 +187,3 @@ class SymmetricNorm(nn.Module):
 def working_dtype(x: Tensor) -> torch.dtype:
     """At least float32."""
     return torch.promote_types(x.dtype, torch.float32)
-
-
-def _event_shape(representation: Representation) -> torch.Size:
-    return torch.Size(getattr(representation, "event_shape", (representation.dim,)))
-
-
-def _flat(representation: Representation) -> Representation:
-    flatten = getattr(representation, "flatten", None)
-    return representation if flatten is None else flatten()

@@ -74,7 +74,7 @@ def offered(env: EnvBase, offer: type[Offer]) -> Offer | None:
 
 
 def seed_unless_own(env: EnvBase, seed: int) -> None:
-    """Seed an environment, whose maker may not have; those that save their own state have been made with it.
+    """Seed an environment, whose maker may not have; those that save their state are trusted.
 
     With a maker that ignores its seed, no run could be repeated, and several seeds would mean nothing.
     """

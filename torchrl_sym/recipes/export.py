@@ -83,8 +83,15 @@ def export_policy(
     if path.suffix == ".pt2":
         torch.export.save(program, path)
     else:
-        names = {"input_names": _names(actor.in_keys), "output_names": ["action"]}
-        torch.onnx.export(program, f=path, dynamo=True, verbose=False, external_data=False, **names)
+        torch.onnx.export(
+            program,
+            f=path,
+            dynamo=True,
+            verbose=False,
+            external_data=False,
+            input_names=_names(actor.in_keys),
+            output_names=["action"],
+        )
     return path
 
 
@@ -153,7 +160,7 @@ def _made_by_transforms(env: EnvBase) -> set[NestedKey]:
 
 
 def _names(keys: list[NestedKey]) -> list[str]:
-    return ["_".join(key) if isinstance(key, tuple) else key for key in keys]
+    return ["_".join(map(str, key)) if isinstance(key, tuple) else str(key) for key in keys]
 
 
 def _require_onnx() -> None:

@@ -8,37 +8,27 @@ which is a fortieth of an iteration of a small task. The networks of the recipe 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
-from torch import nn
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, dispatch
 
 
-class KeyedModule(TensorDictModuleBase):
-    """A network that reads some entries and writes others.
+class KeyedModule(TensorDictModule):
+    """A ``TensorDictModule`` whose network returns a tensor, or a tuple of one per key that is written.
 
     Args:
-        module: takes one tensor per key that is read; returns a tensor, or a tuple of one per key written.
+        module: takes one tensor per key that is read.
         in_keys: what is read.
         out_keys: what is written.
 
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> value = KeyedModule(nn.Linear(3, 1), ["observation"], ["state_value"])
+        >>> value = KeyedModule(torch.nn.Linear(3, 1), ["observation"], ["state_value"])
         >>> value(TensorDict(observation=torch.zeros(4, 3), batch_size=[4]))["state_value"].shape
         torch.Size([4, 1])
     """
 
-    def __init__(
-        self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
-    ) -> None:
-        super().__init__()
-        self.module = module
-        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
-
-    @dispatch(auto_batch_size=False)
+    @dispatch(auto_batch_size=False)  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write what the network makes of its entries into the batch."""
         out = self.module(*(tensordict.get(key) for key in self.in_keys))

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from contextlib import nullcontext
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
@@ -41,7 +41,7 @@ class Learner:
         self,
         config: PPOConfig,
         actor: ProbabilisticTensorDictSequential,
-        critic: TensorDictModuleBase,
+        critic: TensorDictModule,
         symmetry: Symmetry,
     ) -> None:
         self.config, self.actor, self.critic = config, actor, critic
@@ -88,7 +88,7 @@ class Learner:
         size = len(rows) // self.config.minibatches
         reports: list[dict[str, Tensor]] = []
         for _ in range(self.config.epochs):
-            shuffled = rows[torch.randperm(len(rows), device=rows.device)]
+            shuffled = cast("TensorDictBase", rows[torch.randperm(len(rows), device=rows.device)])
             reports += [self._update(minibatch) for minibatch in shuffled.split(size)]
         if self.schedule is not None and self.config.adapt_every == "iteration":
             last = reports[-self.config.minibatches :]
@@ -98,7 +98,8 @@ class Learner:
     def _update(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         """One step of the optimizer; returns the losses and diagnostics that are single numbers."""
         out = self.evaluate(minibatch)
-        total = sum(value for key, value in out.items() if key.startswith("loss_"))
+        first, *others = (value for key, value in out.items() if key.startswith("loss_"))
+        total = sum(others, first)
         for parameter in self.parameters:  # the optimizer's zero_grad() takes ten times as long
             parameter.grad = None
         total.backward()
@@ -163,14 +164,14 @@ class Learner:
         return list(dict.fromkeys([*self.actor.in_keys, *self.critic.in_keys, *own]))
 
 
-def estimate_values(critic: TensorDictModuleBase, data: TensorDictBase) -> None:
+def estimate_values(critic: TensorDictModule, data: TensorDictBase) -> None:
     """Write V of every state and next state of a batch ``[*env, T]``, in one pass of the critic.
 
     A next state is the state of the row after it, except where an episode ends and in the last row.
     """
     keys = critic.in_keys
     data["state_value"] = critic(data.select(*keys))["state_value"]
-    nexts = data["next"]
+    nexts = cast("TensorDictBase", data["next"])
     apart = nexts["done"].squeeze(-1).clone()
     apart[..., -1] = True
     value = torch.cat([data["state_value"][..., 1:, :], data["state_value"][..., :1, :]], dim=-2)
@@ -181,7 +182,7 @@ def estimate_values(critic: TensorDictModuleBase, data: TensorDictBase) -> None:
 def make_losses(
     config: PPOConfig,
     actor: ProbabilisticTensorDictSequential,
-    critic: TensorDictModuleBase,
+    critic: TensorDictModule,
     symmetry: Symmetry,
 ) -> list[LossModule]:
     """The losses to add up: PPO with or without copies, and a mirror loss where none is built in."""

@@ -155,7 +155,7 @@ def make_actor(
     bounds = (config.min_std, config.max_std)
     policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
-        KeyedModule(policy, in_keys, ["loc", "scale"]),
+        KeyedModule(policy, list(in_keys), ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
@@ -173,7 +173,7 @@ def make_critic(
     """State value on the concatenated inputs; arguments as of :func:`make_actor`."""
     _require_norm(config, norm)
     net = FeedForward(in_size, 1, config.hidden, norm=norm, event_dims=event_dims)
-    return KeyedModule(net, in_keys, ["state_value"])
+    return KeyedModule(net, list(in_keys), ["state_value"])
 
 
 def _require_norm(config: PPOConfig, norm: SymmetricNorm | None) -> None:

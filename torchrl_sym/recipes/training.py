@@ -311,9 +311,9 @@ class _Run:
 def _require_finite(data: TensorDictBase, keys: Iterable[NestedKey]) -> None:
     """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
     names = [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]
-    finite = torch.stack([data[name].isfinite().all() for name in names]).tolist()  # fetched at once
-    for name in (name for name, good in zip(names, finite, strict=True) if not good):
-        wrong = data[name].isfinite().logical_not()
+    flags = [data.get(name).isfinite().all() for name in names]
+    for name in (name for name, good in zip(names, torch.stack(flags).tolist(), strict=True) if not good):
+        wrong = data.get(name).isfinite().logical_not()
         bad = int(wrong.flatten(data.ndim).any(-1).sum())
         raise FloatingPointError(
             f"expected finite numbers, got others in {name!r} of {bad} of {data.numel()} samples; end "
