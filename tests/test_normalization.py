@@ -110,8 +110,8 @@ def test_components_of_mixed_and_exchanged_entries():
     turn, flip = PointGroup.rotation(3), PointGroup.reflection("y")
     assert (polar(turn) + scalar(turn) * 2).components.tolist() == [0, 0, 1, 2, 3]
     assert polar(flip).components.tolist() == [0, 1, 2]  # changing sign mixes nothing
-    assert len(components(ring(flip)).unique()) == 7  # five pairs, and two points on the plane
-    assert len(components(wrenches(PointGroup.rotation(4))).unique()) == 9  # 6 of (x, y), 3 of z
+    assert len(ring(flip).components.unique()) == 7  # five pairs, and two points on the plane
+    assert len(wrenches(PointGroup.rotation(4)).components.unique()) == 9  # 6 of (x, y), 3 of z
 
 
 def test_small_differences_of_large_numbers_are_not_lost():

@@ -40,7 +40,8 @@ class GroupAverage(nn.Module):
     def __init__(self, representation: Representation | None) -> None:
         super().__init__()
         self.representation = representation
-        labels = torch.zeros(0, dtype=torch.int64) if representation is None else representation.components.clone()
+        none = torch.zeros(0, dtype=torch.int64)
+        labels = none if representation is None else representation.components.clone()
         self.register_buffer("labels", labels, persistent=False)
         self.register_buffer("sizes", labels.bincount(), persistent=False)
 
@@ -112,7 +113,9 @@ class SymmetricNorm(nn.Module):
         super().__init__()
         if not representations:
             raise ValueError("expected at least one representation, got none")
-        flat = [checks.instance("representations", rep, Representation).flatten() for rep in representations]
+        for representation in representations:
+            checks.instance("representations", representation, Representation)
+        flat = [representation.flatten() for representation in representations]
         self.eps = checks.real("eps", eps, above=0)
         self.until = None if until is None else checks.whole("until", until, 1)
         self.update_in_forward = checks.flag("update_in_forward", update_in_forward)
