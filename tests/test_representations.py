@@ -14,9 +14,12 @@ from tests.point_groups import GROUPS, ODD, PROPER, VERTICAL, assert_close, ever
 from torchrl_sym import PointGroup, Representation
 from torchrl_sym.representations import (
     axial,
+    gait_clock,
     heading,
     height_map,
+    image,
     invariant,
+    items,
     permutation,
     planar,
     points,
@@ -30,6 +33,7 @@ from torchrl_sym.representations import (
 )
 
 SQUARE = {"trivial", "reflect-x", "reflect-y", "C2", "K4", "C4", "D4"}  # map a square grid to itself
+SMALL = set(GROUPS) - {"cube", "D6"}
 GRID = torch.linspace(-0.4, 0.4, 5)
 
 
@@ -42,6 +46,15 @@ def translations(group: PointGroup, signed: bool) -> dict[str, dict[str, str]]:
         }
         for i, g in enumerate(group.names)
     }
+
+
+def places(group: PointGroup) -> Representation:
+    return permutation(group, group.names, translations(group, signed=False))
+
+
+def half_a_period(group: PointGroup) -> dict[str, float]:
+    """A reflection is half a period ahead, a turn is not."""
+    return {name: 0.5 * (group.det[i].item() < 0) for i, name in enumerate(group.names)}
 
 
 BUILDERS = {  # name: (builder, groups that it admits)
@@ -70,6 +83,25 @@ BUILDERS = {  # name: (builder, groups that it admits)
     "points-flat": (lambda g: points(g, scattered(g)[:, :2]), VERTICAL),
     "points-of-vectors": (lambda g: points(g, scattered(g), value=axial(g)), set(GROUPS)),
     "height_map": (lambda g: height_map(g, GRID, GRID), SQUARE),
+    "items": (lambda g: items(places(g), axial(g)), SMALL),
+    "items-that-change-sign": (
+        lambda g: items(signed_permutation(g, g.names, translations(g, signed=True)), polar(g)),
+        SMALL,
+    ),
+    "items-of-several-kinds": (
+        lambda g: items(places(g) + invariant(g, 2), [axial(g)] * g.order + [polar(g), invariant(g, 3)]),
+        SMALL,
+    ),
+    "frames-of-items": (
+        lambda g: items(invariant(g, 2), items(places(g), polar(g))),
+        set(GROUPS) - {"cube"},
+    ),
+    "image": (lambda g: image(g, (4, 4)), SQUARE),
+    "image-of-flow": (lambda g: image(g, (3, 3, 2), "HWC", value=planar(g)), SQUARE),
+    "image-of-flow-channels-first": (lambda g: image(g, (2, 3, 3), "CHW", value=planar(g)), SQUARE),
+    "cameras": (lambda g: items(places(g), image(g, (1, 3), rows="-z", columns="right")), VERTICAL),
+    "gait_clock": (lambda g: gait_clock(g, half_a_period(g)), set(GROUPS)),
+    "unflatten": (lambda g: (polar(g) * 4).unflatten((2, 6)), set(GROUPS)),
     "sum": (lambda g: polar(g) + pseudoscalar(g) + points(g, scattered(g)) + axial(g), set(GROUPS)),
     "repeat": (lambda g: 2 * (pseudoscalar(g) + axial(g)) * 2, set(GROUPS)),
     "absolute": (
@@ -89,8 +121,8 @@ def build(name: str, group: str) -> Representation:
 
 def acted_matrices(rep: Representation) -> torch.Tensor:
     """The matrices as they act: images of the unit vectors, ``(N, d, d)``."""
-    eye = torch.eye(rep.dim, dtype=torch.float64)
-    return torch.stack([rep(eye, g).T for g in range(rep.group.order)])
+    eye = torch.eye(rep.dim, dtype=torch.float64).reshape(rep.dim, *rep.event_shape)
+    return torch.stack([rep(eye, g).reshape(rep.dim, rep.dim).T for g in range(rep.group.order)])
 
 
 # --- what makes it a representation: every builder, every group it admits
@@ -111,7 +143,7 @@ def test_orthogonality(name, group):
 
 @every_case
 def test_identity_changes_nothing(name, group):
-    x = random(5, build(name, group).dim)
+    x = random(5, *build(name, group).event_shape)
     assert_close(build(name, group)(x, 0), x, atol=1e-15)
 
 
@@ -125,9 +157,9 @@ def test_matrices_are_what_acts(name, group):
 @pytest.mark.parametrize("shape", [(), (5,), (5, 3)], ids=str)
 def test_orbit_and_rows_agree_with_single_elements(name, group, shape, dtype):
     rep, n = build(name, group), GROUPS[group].order
-    x = random(*shape, rep.dim, dtype=dtype)
+    x = random(*shape, *rep.event_shape, dtype=dtype)
     images = torch.stack([rep(x, g) for g in GROUPS[group].names])
-    assert images.shape == (n, *shape, rep.dim) and images.dtype == dtype
+    assert images.shape == (n, *shape, *rep.event_shape) and images.dtype == dtype
     assert_close(rep.orbit(x), images, atol=0)
     g = torch.arange(n).reshape(n, *[1] * len(shape)).expand(n, *shape)
     assert_close(rep(x.expand(n, *x.shape), g), images, atol=1e-6 if dtype == torch.float32 else 1e-14)
@@ -136,10 +168,11 @@ def test_orbit_and_rows_agree_with_single_elements(name, group, shape, dtype):
 @every_case
 def test_gradient_is_the_transpose(name, group):
     rep = build(name, group)
-    x = random(4, rep.dim).requires_grad_()
-    cotangent = random(len(GROUPS[group]), 4, rep.dim, seed=1)
+    x = random(4, *rep.event_shape).requires_grad_()
+    cotangent = random(len(GROUPS[group]), 4, *rep.event_shape, seed=1)
     rep.orbit(x).backward(cotangent)
-    assert_close(x.grad, torch.einsum("gbi,gij->bj", cotangent, rep.matrices))
+    expected = torch.einsum("gbi,gij->bj", cotangent.flatten(2), rep.matrices)
+    assert_close(x.grad, expected.reshape(x.shape))
 
 
 @pytest.mark.parametrize(
