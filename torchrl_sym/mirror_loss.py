@@ -239,7 +239,7 @@ class MirrorLoss(LossModule):
         return HeldNetwork(network, self.actor_network_params)
 
     def _borrow(self, inside: HeldNetwork) -> HeldNetwork:
-        self.__dict__["actor_network"] = inside.module  # not registered: its parameters are another's
+        object.__setattr__(self, "actor_network", inside.module)  # unregistered: another has its parameters
         known = self._AcceptedKeys.__dataclass_fields__
         self.set_keys(**{name: key for name, key in inside.keys.items() if name in known})
         return inside
@@ -316,7 +316,9 @@ class MirrorLoss(LossModule):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.in_keys, strict=False), self.in_keys[0])
+        first = self.in_keys[0]
+        dims = _event_dims(self.symmetry[first]) if first in self.symmetry else 1
+        state = batched(tensordict.select(*self.in_keys, strict=False), first, dims)
         orbit = self.symmetry.orbit(state)  # [N, *B], identity first
         with evaluating(self.actor_network):
             members = self._held.each(lambda: self._error(orbit))
@@ -350,7 +352,7 @@ def _event_dims(act: Representation | None) -> int:
     return len(getattr(act, "event_shape", (1,)))
 
 
-def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
+def batched(tensordict: TensorDictBase, key: NestedKey, event_dims: int = 1) -> TensorDictBase:
     """Give a tensordict that a keyword call has built the batch size of one of its entries.
 
     ``dispatch`` takes the longest shape that all entries share, at times with their last dimension.
@@ -362,5 +364,5 @@ def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
             f"{sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))}"
         )
     if tensordict.batch_dims in (0, value.ndim):
-        tensordict.batch_size = value.shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
+        tensordict.batch_size = value.shape[: value.ndim - event_dims]  # pyright: ignore[reportAttributeAccessIssue]
     return tensordict
