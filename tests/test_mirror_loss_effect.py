@@ -79,6 +79,8 @@ def test_inner_network_of_a_loss():
         train(mirror(sac.qvalue_network), torch.optim.SGD(sac.parameters(), 1e-3))
     reaching = MirrorLoss.of(sac, symmetry=make_symmetry())
     reaching.patience = 10
+    with pytest.raises(RuntimeError, match="no optimizer holds them; give those of the loss to one"):
+        train(copy.deepcopy(reaching), None)
     train(reaching, torch.optim.SGD(sac.parameters(), 1e-3))
 
 

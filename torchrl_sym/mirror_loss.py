@@ -246,7 +246,7 @@ class MirrorLoss(LossModule):
         return HeldNetwork(network, self.actor_network_params)
 
     def _borrow(self, inside: HeldNetwork) -> HeldNetwork:
-        vars(self)["actor_network"] = inside.module  # not registered: its parameters are another's
+        object.__setattr__(self, "actor_network", inside.module)  # unregistered: another has its parameters
         known = self._AcceptedKeys.__dataclass_fields__
         self.set_keys(**{name: key for name, key in inside.keys.items() if name in known})
         return inside

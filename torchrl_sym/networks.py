@@ -24,6 +24,13 @@ from torchrl_sym import checks
 
 T = TypeVar("T")
 
+# What to do about parameters that no optimizer holds.
+_OWN = "give those of the loss to one"
+_COPIED = (
+    "SACLoss, TD3Loss, REDQLoss and other losses train copies of the network that they are given: use "
+    "MirrorLoss.of(loss, 'qvalue_network', symmetry=...), which reaches them"
+)
+
 
 @dataclass(frozen=True, eq=False)
 class HeldNetwork:
@@ -159,10 +166,8 @@ class Effect:
                 raise RuntimeError(
                     f"{piled} gradients have been added up in the parameters of the network that writes "
                     f"{self.held.module.out_keys}, and nobody has cleared them or changed the parameters: "
-                    "no optimizer holds them. SACLoss, TD3Loss, REDQLoss and other losses train copies of "
-                    "the network that they are given: use MirrorLoss.of(loss, 'qvalue_network', "
-                    "symmetry=...), which reaches them. If so many gradients are added up on purpose, "
-                    "raise the loss's patience"
+                    f"no optimizer holds them; {_OWN if self.held.borrowed else _COPIED}. If so many "
+                    "gradients are added up on purpose, raise the loss's patience"
                 )
             self._proven = True
 
