@@ -1,10 +1,11 @@
 """How fast the hot paths are, as ratios to what they could be at best, measured side by side.
 
-    python benchmarks/speed.py            # all, about six minutes on two cores
-    python benchmarks/speed.py --only env
+    python benchmarks/speed.py            # all, about fifteen minutes on two cores
+    python benchmarks/speed.py --only options
 
 Every table compares our code with its limit in one run: environments with raw physics, losses with plain
-ClipPPOLoss and with bare torch of the same arithmetic, augmentation with a copy of memory. The variants of
+ClipPPOLoss and with bare torch of the same arithmetic, augmentation with a copy of memory, iterations of
+training with rsl_rl's (where it is installed, see peer.py). The variants of
 a row are timed in turn, round by round, so that a machine that slows down slows all of them; a figure is
 the median over rounds, a ratio the median of the rounds' ratios. One torch thread.
 """
@@ -16,6 +17,7 @@ import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Literal
@@ -36,6 +38,9 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from torchrl.objectives import ClipPPOLoss
 
 import tasks
+from iterations import measure_iterations, measure_options
+from measuring import cell, interleave, ratio, show
+from peer import INSTALLED
 from torchrl_sym import PointGroup, SymmetricClipPPOLoss, Symmetry, SymmetryAugment
 from torchrl_sym.representations import axial, polar, signed_permutation
 
@@ -47,8 +52,8 @@ LOSS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01, "critic_coeff": 1.0, "loss_c
 class Arguments:
     """Measure and print ratios."""
 
-    only: Literal["env", "loss", "augment"] | None = None
-    """One of the tables."""
+    only: Literal["env", "loss", "augment", "iteration", "options"] | None = None
+    """One of the tables; that of options, which compiles for minutes, is made only if it is asked for."""
     tasks: tuple[str, ...] = tasks.ALL_TASKS
     """Tasks whose environments are timed."""
     rounds: int = 15
@@ -65,42 +70,11 @@ class Arguments:
     """Where the figures go."""
 
 
-def interleave(variants: dict[str, Callable[[], object]], rounds: int) -> dict[str, list[float]]:
-    """Seconds of each variant, round by round, after two rounds of warm-up."""
-    seconds: dict[str, list[float]] = {name: [] for name in variants}
-    for round_ in range(rounds + 2):
-        for name, run in variants.items():
-            start = time.perf_counter()
-            run()
-            if round_ >= 2:
-                seconds[name].append(time.perf_counter() - start)
-    return seconds
-
-
-def ratio(seconds: dict[str, list[float]], a: str, b: str) -> float:
-    """Median over the rounds of time a over time b."""
-    return median(x / y for x, y in zip(seconds[a], seconds[b], strict=True))
-
-
-def show(table: list[dict]) -> None:
-    """Print the last row of a table, under its header if it is the first."""
-    widths = {key: max(len(key), 9) for key in table[-1]}
-    if len(table) == 1:
-        print("  ".join(f"{key:>{width}s}" for key, width in widths.items()))
-    print("  ".join(f"{cell(table[-1][key]):>{width}s}" for key, width in widths.items()))
-
-
-def cell(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-    return str(value)
-
-
 def markdown(results: dict) -> str:
     """All tables, for people; the JSON file has the same figures for programs."""
     versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
     text = f"Made by `python benchmarks/speed.py` on {results['machine']['processor']}; {versions}.\n"
-    for name in ("env", "loss", "augment"):
+    for name in TABLES:
         if name in results:
             keys = list(results[name][0])
             lines = [keys, ["---:"] * len(keys), *([cell(row[k]) for k in keys] for row in results[name])]
@@ -351,17 +325,39 @@ def measure_augmentation(arguments: Arguments) -> list[dict]:
     return table
 
 
+# --- training
+
+
+def measure_training(arguments: Arguments, measure: Callable) -> list[dict]:
+    """A table of iterations.py."""
+    print(f"\n{measure.__doc__}")
+    table = []
+    for row in measure(arguments.tasks, arguments.rounds):
+        table.append(row)
+        show(table)
+    return table
+
+
+TABLES: dict[str, Callable[[Arguments], list[dict]]] = {
+    "env": measure_envs,
+    "loss": measure_losses,
+    "augment": measure_augmentation,
+    "iteration": functools.partial(measure_training, measure=measure_iterations),
+    "options": functools.partial(measure_training, measure=measure_options),
+}
+
+
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
-    tables = {"env": measure_envs, "loss": measure_losses, "augment": measure_augmentation}
     results = {
         name: measure(arguments)
-        for name, measure in tables.items()
-        if arguments.only is None or arguments.only == name
+        for name, measure in TABLES.items()
+        if name == arguments.only or (arguments.only is None and name != "options")
     }
     results["versions"] = {
         "python": platform.python_version(),
         **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
+        "rsl_rl": version("rsl-rl-lib") if INSTALLED else "not installed",
     }
     results["machine"] = {"processor": processor(), "physics_threads": arguments.threads}
     if arguments.output is not None:

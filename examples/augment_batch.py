@@ -2,13 +2,15 @@
 
 A four-legged robot with equal legs is symmetric under the Klein four-group: front-back reflection,
 left-right reflection, and their product, the half turn. Declare how each part of the observation
-transforms, in the order of its entries, and `SymmetryAugment` makes the copies.
+transforms, in the order of its entries, and `SymmetryAugment` makes the copies. For off-policy learning,
+`SymmetryReplayBuffer` makes them of what it samples.
 """
 
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage
 
-from torchrl_sym import PointGroup, Symmetry, SymmetryAugment
+from torchrl_sym import PointGroup, Symmetry, SymmetryAugment, SymmetryReplayBuffer
 from torchrl_sym.representations import axial, height_map, polar, signed_permutation
 
 LEGS = ("LF", "RF", "LH", "RH")  # left and right, front and hind
@@ -53,3 +55,8 @@ print("base velocity of sample 0 in each copy:")
 for name, velocity in zip(group.names, copies["observation"][:, 0, :3], strict=True):
     print(f"  {name:10s} {velocity.numpy().round(2)}")
 assert (copies["action_log_prob"] == batch["action_log_prob"]).all(), "copies share the log-probability"
+
+buffer = SymmetryReplayBuffer(symmetry, storage=LazyTensorStorage(1000), batch_size=16)
+buffer.extend(batch)
+sample = buffer.sample()
+print(f"the buffer has {len(buffer)} samples and gives {len(sample)}, {buffer.batch_size} of each element")

@@ -6,11 +6,14 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
 
 import tasks
 from tasks.environment import BatchedEnv
 from torchrl_sym.recipes import PPOConfig, train
-from torchrl_sym.recipes.learner import Learner
+from torchrl_sym.recipes.learner import Learner, estimate_values
 from torchrl_sym.recipes.networks import gaussian, make_networks
 
 TINY = PPOConfig(iterations=3, num_envs=8, horizon=16, epochs=2, minibatches=2)
@@ -32,7 +35,7 @@ def test_the_rate_is_adapted_before_the_step_it_is_meant_for(monkeypatch):
     events = []
     step, adapt = learner.optimizer.step, learner.schedule.step
     rate = learner.optimizer.param_groups[0]
-    monkeypatch.setattr(learner.optimizer, "step", lambda: (events.append(rate["lr"]), step()))
+    monkeypatch.setattr(learner.optimizer, "step", lambda: (events.append(float(rate["lr"])), step()))
     monkeypatch.setattr(learner.schedule, "step", lambda kl: (events.append(float(kl)), adapt(kl)))
     learner.learn(data)
     kl, rates = events[::2], events[1::2]
@@ -162,3 +165,140 @@ def test_a_kl_that_is_not_finite_ends_a_run_only_if_the_rate_follows_it(steers, 
             learner.learn(data)
     else:
         assert learner.learn(data)["kl"] == math.inf
+
+
+def test_learning_is_what_torchrl_parts_would_do():
+    """The whole update against TorchRL's own estimator and loss, minibatch by minibatch."""
+    config = dataclasses.replace(TINY, augmentation="none", desired_kl=None)
+    learner, data = make_learner(config)
+    other, _ = make_learner(config)
+    data = broken_episodes(data)
+
+    torch.manual_seed(1)
+    metrics = learner.learn(data.clone())
+
+    torch.manual_seed(1)
+    actor, critic = other.actor, other.critic
+    GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=critic, average_gae=True)(data)
+    loss = ClipPPOLoss(
+        actor,
+        critic,
+        clip_epsilon=config.clip_epsilon,
+        clip_value=config.clip_value,
+        entropy_coeff=config.entropy_coeff,
+        critic_coeff=config.critic_coeff,
+        loss_critic_type="l2",
+    )
+    rows, reports = data.detach().reshape(-1), []
+    optimizer = torch.optim.Adam(other.parameters, lr=config.learning_rate)
+    for _ in range(config.epochs):
+        for index in torch.randperm(len(rows)).chunk(config.minibatches):
+            out = loss(rows[index])
+            optimizer.zero_grad()
+            (out["loss_objective"] + out["loss_critic"] + out["loss_entropy"]).backward()
+            torch.nn.utils.clip_grad_norm_(other.parameters, config.max_grad_norm)
+            optimizer.step()
+            other.policy.keep_in_bounds()
+            reports.append(out.detach())
+    for mine, theirs in zip(learner.parameters, other.parameters, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-4, atol=1e-6)
+    for name in ("loss_objective", "loss_critic", "loss_entropy", "kl_approx", "ESS", "explained_variance"):
+        expected = float(torch.stack([report[name] for report in reports]).mean())
+        assert metrics[name] == pytest.approx(expected, rel=1e-4, abs=1e-6), name
+
+
+def broken_episodes(data):
+    """The batch as if episodes had ended in it, with true last observations of their own."""
+    data = data.clone()
+    for row, step, flag in ((1, 5, "truncated"), (2, 0, "terminated"), (3, -1, "truncated")):
+        data["next", "done"][row, step] = data["next", flag][row, step] = True
+        data["next", "observation"][row, step] += 3.0
+    return data
+
+
+def test_values_of_next_states_take_one_pass():
+    learner, data = make_learner(TINY)
+    data = broken_episodes(data)
+    expected = data.clone()
+    GAE(gamma=0.9, lmbda=0.9, value_network=learner.critic)(expected)
+    rows = []
+    hook = learner.critic.module.register_forward_pre_hook(lambda _, inputs: rows.append(inputs[0]))
+    with torch.no_grad():
+        estimate_values(learner.critic, data)
+    hook.remove()
+    for key in ("state_value", ("next", "state_value")):
+        torch.testing.assert_close(data[key], expected[key].detach())
+    passed = sum(x.shape[:-1].numel() for x in rows)
+    assert passed == data.numel() + len(data) + 2  # two episodes ended before the last step
+
+
+@pytest.mark.parametrize("adapt_every", ["minibatch", "iteration"])
+def test_the_host_waits_for_no_minibatch_of_an_accelerator(adapt_every, monkeypatch):
+    """A tensor on the meta device has no value that could be asked for: what asks raises."""
+    learner, _ = make_learner(dataclasses.replace(TINY, adapt_every=adapt_every))
+    monkeypatch.setattr(learner.optimizer, "step", lambda: None)
+    weight = torch.nn.Parameter(torch.ones(3, device="meta"))
+    number = torch.ones((), device="meta")
+    learner.parameters = [weight]
+    learner.evaluate = lambda _: {
+        "loss_objective": weight.sum(),
+        "mean_ratio": number,
+        "kl_approx": number,
+    }
+    report = learner._update(TensorDict())
+    with pytest.raises(RuntimeError, match="meta"):
+        float(report["kl"])
+    rate = learner.optimizer.param_groups[0]["lr"]
+    assert isinstance(rate, torch.Tensor) == (adapt_every == "minibatch")
+
+
+@pytest.mark.parametrize("augmentation", ["none", "all"])
+def test_bfloat16_products_change_updates_a_little(augmentation):
+    config = dataclasses.replace(TINY, augmentation=augmentation, epochs=1, minibatches=1, desired_kl=None)
+    changes = []
+    for autocast in (None, "bfloat16"):
+        learner, data = make_learner(dataclasses.replace(config, autocast=autocast))
+        learner.learn(data)
+        changes.append(torch.cat([p.grad.flatten() for p in learner.parameters]))
+        assert all(p.dtype == torch.float32 for p in learner.parameters)
+    exact, rough = changes
+    error = float((exact - rough).norm() / exact.norm())
+    assert 1e-5 < error < 0.1
+
+
+@pytest.mark.slow
+def test_compiled_losses_learn_the_same():
+    for augmentation in ("none", "all"):
+        config = dataclasses.replace(TINY, augmentation=augmentation, epochs=1, desired_kl=None)
+        parameters = []
+        for compile_ in (False, True):
+            learner, data = make_learner(dataclasses.replace(config, compile=compile_))
+            torch.manual_seed(1)
+            learner.learn(data)
+            parameters.append(learner.parameters)
+        for plain, compiled in zip(*parameters, strict=True):
+            torch.testing.assert_close(plain, compiled, rtol=1e-4, atol=1e-5)
+
+
+def test_without_a_compiler_training_goes_on_with_a_warning(monkeypatch):
+    def broken(function):
+        def fail(*args):
+            raise RuntimeError("no working C++ compiler found")
+
+        return fail
+
+    monkeypatch.setattr(torch, "compile", broken)
+    with pytest.warns(RuntimeWarning, match="no working C.. compiler found.; install a C.. compiler"):
+        learner, data = make_learner(dataclasses.replace(TINY, compile=True))
+    assert math.isfinite(learner.learn(data)["kl"])
+
+
+def test_compilation_may_change_when_a_run_is_continued_and_precision_not():
+    stored = dataclasses.asdict(TINY)
+    assert dataclasses.replace(TINY, compile=True).differences(stored) == {}
+    rough = dataclasses.replace(TINY, autocast="bfloat16")
+    assert rough.differences(stored) == {"autocast": (None, "bfloat16")}
+    with pytest.raises(ValueError, match=r"autocast: expected one of \['bfloat16'\], got 'float16'"):
+        dataclasses.replace(TINY, autocast="float16")
+    with pytest.raises(TypeError, match="compile: expected True or False, got 'yes'"):
+        dataclasses.replace(TINY, compile="yes")

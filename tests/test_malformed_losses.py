@@ -1,10 +1,12 @@
 """Malformed arguments of transforms, losses and assertions are refused, and so are misspelt keywords."""
 
+import functools
 import inspect
 import math
 
 import pytest
 import torch
+from torchrl.data import LazyTensorStorage
 from torchrl.objectives import ClipPPOLoss, PPOLoss
 
 import tasks
@@ -21,11 +23,18 @@ from tests.malformed import (
     number,
     optional,
     subject,
-    tensor,
     thing,
 )
 from tests.networks import make_actor, make_batch, make_critic, make_symmetry
-from torchrl_sym import MirrorLoss, SymmetricClipPPOLoss, SymmetryAugment, SymmetryOrbit, checks, testing
+from torchrl_sym import (
+    MirrorLoss,
+    SymmetricClipPPOLoss,
+    SymmetryAugment,
+    SymmetryOrbit,
+    SymmetryReplayBuffer,
+    checks,
+    testing,
+)
 from torchrl_sym import representations as r
 
 SYMMETRY, BATCH = make_symmetry("K4"), make_batch()
@@ -46,7 +55,6 @@ PPO = (
     "mirror_coeff elements clip_epsilon entropy_coeff critic_coeff normalize_advantage reduction "
     "clip_value separate_losses value_key"
 )
-fold = SymmetryOrbit(SYMMETRY).fold
 
 SUBJECTS = [
     subject(
@@ -63,7 +71,15 @@ SUBJECTS = [
     subject("augment", SymmetryAugment(SYMMETRY).augment, tensordict=batch.but(**{"one row": BATCH[0]})),
     subject("augment(batch)", SymmetryAugment(SYMMETRY), tensordict=batch),
     subject("SymmetryOrbit", SymmetryOrbit, "elements", symmetry=symmetry, elements=elements),
-    subject("fold", fold, priority=tensor(torch.rand(8), **{"of other anchors": torch.rand(7)})),
+    subject(
+        "SymmetryReplayBuffer",
+        functools.partial(SymmetryReplayBuffer, storage=LazyTensorStorage(8)),
+        "elements when batch_size prefetch",
+        symmetry=symmetry,
+        elements=elements,
+        when=choice("extend"),
+        batch_size=optional(count(4)),
+    ),
     subject(
         "MirrorLoss",
         MirrorLoss,

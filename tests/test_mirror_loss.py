@@ -381,5 +381,5 @@ def test_network_without_a_known_output_is_an_error():
 
 def test_observation_of_another_size_is_an_error():
     loss = MirrorLoss(make_actor(), symmetry=make_symmetry())
-    with pytest.raises(ValueError, match="expected a last dimension of 4"):
+    with pytest.raises(ValueError, match="expected event dimensions"):
         loss(TensorDict(observation=torch.zeros(2, 5), batch_size=[2]))

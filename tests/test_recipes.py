@@ -231,7 +231,7 @@ def test_other_environments_train_too(count):
 def test_symmetry_that_does_not_fit_is_refused():
     group = PointGroup.reflection("x")
     sign = pseudoscalar(group)
-    with pytest.raises(ValueError, match="expected a last dimension of 2"):
+    with pytest.raises(ValueError, match=r"expected event dimensions \(2,\)"):
         list(train(TINY, MAKE_ENV, Symmetry(group, {"observation": sign * 2, "action": sign})))
     with pytest.raises(KeyError, match="observation"):
         list(train(TINY, MAKE_ENV, Symmetry(group, {"state": sign * 3, "action": sign})))

@@ -1,4 +1,4 @@
-"""Augmentation in replay buffers: storages, sample and extend time, orbits, and who is refused."""
+"""Copies in the buffers of TorchRL: by SymmetryAugment when sampling and extending, by SymmetryOrbit."""
 
 import pytest
 import torch
@@ -18,6 +18,7 @@ from tests.buffers import (
     assert_images,
     assert_orbits,
     buffers,
+    elements_of,
     filled,
     numbers,
     rows,
@@ -128,24 +129,19 @@ def test_extending_fills_a_storage_of_exactly_the_right_size(layout, ndim, shape
     assert torch.equal(buffer[:]["observation"], stored["observation"])
 
 
-@buffers
-def test_a_storage_that_is_too_small_is_refused_and_stays_empty(buffer):
-    augment = SymmetryAugment(make_symmetry(), when="extend")
-    out = buffer(storage=LazyTensorStorage(ROWS), transform=augment)
-    with pytest.raises(
-        RuntimeError, match=r"holds 24 rows, but 24 rows .* are 48.*make the storage 2 times"
-    ):
-        out.extend(rows())
-    assert len(out) == 0
+def test_add_stores_one_record_of_all_copies():
+    # TorchRL's add hands over a batch of one row, warns, and stores what comes of it as one record
+    augment = SymmetryAugment(make_symmetry("K4"), when="extend")
+    out = ReplayBuffer(storage=LazyTensorStorage(ROWS), transform=augment, batch_size=DRAWN)
+    with pytest.warns(UserWarning, match="Use `extend\\(\\)`"):
+        out.add(rows()[0])
+    assert_orbits(out.sample().unbind(-1), "K4")
 
 
-@buffers
-def test_add_is_refused(buffer):
+def test_add_is_refused_where_it_hands_over_a_single_row():
     augment = SymmetryAugment(make_symmetry(), when="extend")
-    out = buffer(storage=LazyTensorStorage(ROWS), transform=augment)
-    with pytest.raises(
-        RuntimeError, match=r"single row has no place .* use buffer.extend\(row.unsqueeze\(0\)\)"
-    ):
+    out = TensorDictReplayBuffer(storage=LazyTensorStorage(ROWS), transform=augment)
+    with pytest.raises(RuntimeError, match=r"single row has no place .* use buffer.extend"):
         out.add(rows()[0])
     out.extend(rows()[:1])
     assert len(out) == 2
@@ -162,14 +158,6 @@ def test_add_works_when_copies_are_made_by_sampling(buffer):
 # --- the naive rule
 
 
-def test_log_prob_from_is_refused_when_sampling():
-    augment = SymmetryAugment(make_symmetry(), log_prob_from=make_actor())
-    with pytest.raises(
-        RuntimeError, match="has changed by the time a buffer is sampled; use when='extend'"
-    ):
-        filled(ReplayBuffer, transform=augment).sample()
-
-
 def test_log_prob_from_works_when_extending():
     actor = make_actor()
     augment = SymmetryAugment(make_symmetry(), when="extend", log_prob_from=actor)
@@ -181,11 +169,9 @@ def test_log_prob_from_works_when_extending():
 # --- TensorDictReplayBuffer, which fixes the number of records
 
 
-def test_cat_is_refused_where_records_are_fixed():
+def test_torchrl_refuses_cat_where_records_are_fixed():
     buffer = filled(TensorDictReplayBuffer, transform=SymmetryAugment(make_symmetry()))
-    with pytest.raises(
-        RuntimeError, match=r"TensorDictReplayBuffer fixes the number .*'cat'.*SymmetryOrbit\("
-    ):
+    with pytest.raises(RuntimeError, match=r"one of the transforms has probably modified the shape"):
         buffer.sample()
 
 
@@ -204,6 +190,9 @@ def test_random_elements_keep_the_number_of_records(buffer):
     assert len(batch) == DRAWN and 0 < flipped.sum() < DRAWN
     assert_images(batch[~flipped], "C2", 0)
     assert_images(batch[flipped], "C2", 1)
+
+
+# --- SymmetryOrbit, by hand
 
 
 @buffers
@@ -234,21 +223,69 @@ def test_orbit_in_a_multidimensional_storage(buffer):
 
 
 @buffers
-def test_orbit_leaves_indexing_alone(buffer):
+def test_orbit_with_random_elements(buffer):
+    torch.manual_seed(0)
+    out = filled(buffer, **with_orbit("K4", "random"))
+    batch, info = out.sample(return_info=True)
+    assert len(batch) == DRAWN
+    assert torch.equal(elements_of(batch, "K4"), info["symmetry_id"])
+    assert info["symmetry_id"].unique().numel() > 1
+
+
+@buffers
+def test_rows_are_read_by_index_as_stored(buffer):
     out = filled(buffer, **with_orbit())
+    out.sample()
     for index in (3, slice(None), slice(4, 8), torch.tensor([5, 1])):
         assert torch.equal(out[index]["observation"], rows()[index]["observation"])
+    assert_orbits(out.sample().split(DRAWN))
 
 
-def test_orbit_refuses_random_elements_and_a_missing_sample_unit():
-    with pytest.raises(ValueError, match=r"use SymmetryAugment\(elements='random'\)"):
-        SymmetryOrbit(make_symmetry(), "random")
-    buffer = filled(ReplayBuffer, batch_size=5, transform=SymmetryOrbit(make_symmetry()).transform())
-    with pytest.raises(RuntimeError, match=r"rows as they are stored; pass the orbit .* sample_unit=orbit"):
-        buffer.sample()
+def test_buffers_that_share_storage_and_orbit():
+    pair, storage = with_orbit(), LazyTensorStorage(ROWS)
+    first = filled(ReplayBuffer, storage=storage, **pair)
+    other = {"sample_unit": pair["sample_unit"], "transform": pair["sample_unit"].transform()}
+    second = ReplayBuffer(storage=storage, batch_size=DRAWN, **other)
+    plain = ReplayBuffer(storage=storage, batch_size=DRAWN)
+    for buffer in (first, second, first):
+        assert_orbits(buffer.sample().split(DRAWN))
+    assert_orbits([plain.sample()], "C1")
 
 
-def test_fold_takes_the_largest_over_the_copies():
-    orbit = SymmetryOrbit(make_symmetry("K4"), ["reflect-x"])
-    assert orbit.fold(torch.tensor([1.0, 5.0, 2.0, 4.0, 3.0, 2.0])).tolist() == [4, 5, 2]
-    assert orbit.fold(torch.ones(6, 1)).shape == (3, 1)
+@buffers
+@pytest.mark.parametrize("others", [None, lambda: with_orbit("C3")["transform"]], ids=["none", "another's"])
+def test_an_orbit_without_its_transform_is_refused(buffer, others):
+    out = filled(buffer, **with_orbit() | {"transform": others and others()})
+    found = "that of another orbit" if others else "none"
+    with pytest.raises(RuntimeError, match=f"own transform in the buffer, got {found}; .*orbit.transform"):
+        out.sample()
+
+
+@buffers
+def test_a_transform_without_its_orbit_is_refused(buffer):
+    out = filled(buffer, batch_size=5, transform=SymmetryOrbit(make_symmetry()).transform())
+    with pytest.raises(RuntimeError, match=r"as they are stored; pass that orbit .* sample_unit=orbit"):
+        out.sample()
+
+
+def test_a_transform_that_changes_the_number_of_rows_is_refused():
+    pair = with_orbit()
+    pair["transform"] = Compose(lambda td: td[:5], pair["transform"])
+    with pytest.raises(RuntimeError, match=r"expected the 16 rows that were sampled, got 5.*put it behind"):
+        filled(ReplayBuffer, **pair).sample()
+
+
+def test_an_orbit_in_a_storage_that_was_set_later_is_refused():
+    out = filled(ReplayBuffer, **with_orbit())
+    out.set_storage(LazyTensorStorage(ROWS))
+    out.writer.register_storage(out.storage)
+    out.extend(rows())
+    with pytest.raises(RuntimeError, match=r"one storage from the start.* use one SymmetryReplayBuffer"):
+        out.sample()
+    out.storage.attach(out)
+    assert_orbits(out.sample().split(DRAWN))
+
+
+def test_the_batch_must_have_what_the_symmetry_declares():
+    with pytest.raises(KeyError, match=r"the batch lacks \['action'\]"):
+        filled(ReplayBuffer, rows().exclude("action"), **with_orbit()).sample()

@@ -49,6 +49,13 @@ def test_symmetric_ppo():
     assert "iteration 1" in run("examples/symmetric_ppo.py", "2")
 
 
+def test_memory():
+    tiny = ["--seeds", "1", "--iterations", "2", "--num-envs", "4", "--steps", "5"]
+    output = run("examples/memory.py", *tiny)
+    assert re.search(r"recurrent, seed 0: return -\d.*of mirror images", output)
+    assert re.search(r"with memory -\d[\d.]*, without -\d", output)
+
+
 @pytest.mark.parametrize("script", ["examples/sac.py", "examples/td3.py"])
 def test_off_policy_examples(script):
     output = run(script, "500")
@@ -160,12 +167,13 @@ def test_what_policies_do_is_drawn_from_the_stored_ones(tmp_path, name, task, ki
 @pytest.mark.slow
 def test_speed_writes_its_figures(tmp_path):
     figures = tmp_path / "speed.json"
-    tiny = ["--tasks", "anymal_push", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
+    tiny = ["--tasks", "cartpole", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
     run("benchmarks/speed.py", *tiny, "--output", figures)
     results = json.loads(figures.read_text())
     assert results["env"][0]["env_over_raw"] > 0
     assert {row["order"] for row in results["loss"]} == {1, 2, 4}
     assert {row["elements"] for row in results["augment"]} == {"all", "random"}
+    assert {row["augmentation"] for row in results["iteration"]} == {"none", "all"}
 
 
 @pytest.mark.parametrize("number", range(3))

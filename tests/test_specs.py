@@ -45,14 +45,14 @@ def test_running_normaliser_of_a_declared_observation_is_refused():
     symmetry = cartpole().symmetry
     symmetry.check_specs(cartpole(RewardSum(), StepCounter()))
     symmetry.check_specs(cartpole(VecNormV2(in_keys=["reward"])))
-    with pytest.raises(ValueError, match=r"VecNormV2 normalises \['observation'\] by running statistics"):
+    with pytest.raises(ValueError, match=r"VecNormV2 does not commute .* of 'observation'"):
         symmetry.check_specs(cartpole(VecNormV2(in_keys=["observation"]), StepCounter()))
 
 
 @pytest.mark.parametrize("leaf", ["loc", "scale"])
 def test_observation_named_like_a_distribution_parameter_must_be_declared(leaf):
     env = Fields(Bounded(-1, 1, (1,)), **{leaf: Unbounded((1,))})
-    with pytest.raises(KeyError, match=f"the environment has '{leaf}'"):
+    with pytest.raises(KeyError, match=rf"the environment has \['{leaf}'\]"):
         Symmetry(REFLECTION, {"action": SIGN}).check_specs(env)
     assert leaf not in Symmetry(REFLECTION, {"action": SIGN})
     Symmetry(REFLECTION, {"action": SIGN, leaf: SIGN}).check_specs(env)

@@ -16,7 +16,8 @@ from torchrl.objectives import ClipPPOLoss
 
 from tests.networks import make_actor, make_batch, make_symmetry
 from torchrl_sym import MirrorLoss, PointGroup, SymmetricClipPPOLoss, Symmetry, SymmetryAugment
-from torchrl_sym.representations import invariant, permutation, pseudoscalar
+from torchrl_sym.entries import split
+from torchrl_sym.representations import invariant, items, permutation, pseudoscalar
 
 GROUP = PointGroup.reflection("x")
 SIGN = pseudoscalar(GROUP)
@@ -49,13 +50,15 @@ def batch_of(*shape):
 def test_random_elements_with_agents_agree_with_one_row_per_agent(agents):
     torch.manual_seed(0)
     actor, critic = gaussian(nn.Linear(3, 2)), ValueOperator(nn.Linear(3, 1), in_keys=["observation"])
-    loss = SymmetricClipPPOLoss(actor, critic, symmetry=SYMMETRY, elements="random", mirror_coeff=0.5)
+    places = invariant(GROUP, agents)
+    symmetry = Symmetry(GROUP, {"observation": items(places, SIGN * 3), "action": items(places, SIGN)})
+    loss = SymmetricClipPPOLoss(actor, critic, symmetry=symmetry, elements="random", mirror_coeff=0.5)
     batch = batch_of(6, agents)
     torch.manual_seed(1)
     element = torch.randint(2, (6,))
     torch.manual_seed(1)
     out = loss(batch)
-    mapped = SYMMETRY(batch.select("observation", "action"), element).update(
+    mapped = symmetry(batch.select("observation", "action"), element).update(
         batch.exclude("observation", "action")
     )
     plain = ClipPPOLoss(actor, critic)
@@ -81,12 +84,22 @@ def test_critic_may_read_what_the_actor_computes():
     assert torch.equal(loss(stale)["loss_critic"], loss(batch)["loss_critic"])
 
 
-def test_keys_that_copies_share_may_be_read():
-    actor = gaussian(nn.Linear(4, 2), ["observation"])
-    actor[0].in_keys = ["observation", "step_count"]
-    SYMMETRY.require(["observation", "step_count", "is_init"], "the actor")
-    with pytest.raises(KeyError, match=r"memory.*not a linear image"):
-        SYMMETRY.require(["recurrent_state_h"], "the actor")
+READ = ["mask", "index", "returns", "reward", "step_count", "_hidden", "any_log_prob", ("collector", "x")]
+
+
+@pytest.mark.parametrize("key", READ, ids=str)
+def test_what_a_network_reads_must_be_declared_whatever_its_name(key):
+    actor, critic = (
+        gaussian(nn.Linear(4, 2), ["observation", key]),
+        ValueOperator(nn.Linear(3, 1), in_keys=["observation"]),
+    )
+    with pytest.raises(KeyError, match=f"the actor reads .*{split(key)[1]}"):
+        SymmetricClipPPOLoss(actor, critic, symmetry=SYMMETRY)
+    with pytest.raises(KeyError, match="the network reads"):
+        MirrorLoss(actor, symmetry=SYMMETRY)
+    declared = Symmetry(GROUP, {"observation": SIGN * 3, "action": SIGN, key: invariant(GROUP, 1)})
+    SymmetricClipPPOLoss(actor, critic, symmetry=declared)
+    SYMMETRY.require(["observation", "is_init"], "the actor")
 
 
 def test_mirror_loss_of_one_hot_actions_compares_probabilities():

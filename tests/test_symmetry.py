@@ -12,7 +12,14 @@ from torchrl.envs import EnvBase
 
 from tests.point_groups import GROUPS, assert_close, random
 from torchrl_sym import PointGroup, Symmetry
-from torchrl_sym.representations import invariant, planar, polar, pseudoscalar, signed_permutation
+from torchrl_sym.representations import (
+    invariant,
+    items,
+    planar,
+    polar,
+    pseudoscalar,
+    signed_permutation,
+)
 
 every_symmetric_group = pytest.mark.parametrize("group", ["trivial", "reflect-y", "K4", "C3", "D3"])
 
@@ -80,12 +87,16 @@ def test_each_row_is_mapped_by_its_own_element(group, shape):
         assert_same(image[rows], symmetry(batch[rows], element), atol=1e-6)
 
 
-def test_entries_may_have_more_batch_dimensions_than_the_batch():
-    symmetry, per_agent = make_symmetry(), make_batch(6, 3)
-    batch = per_agent.auto_batch_size_(1)
+def test_items_that_stay_in_place_are_mapped_one_by_one():
+    per_agent = make_batch(6, 3)
+    batch = per_agent.copy().auto_batch_size_(1)
+    with pytest.raises(ValueError, match=r"expected event dimensions \(4,\), got \(3, 4\).*items"):
+        make_symmetry()(batch, 1)
+    group, single = GROUPS["K4"], make_symmetry()
+    agents = {key: items(invariant(group, 3), single[key]) for key in single.keys()}  # noqa: SIM118
     g = torch.arange(6) % 4
-    for image, row, element in zip(symmetry(batch, g), batch, g, strict=True):
-        assert_same(image, symmetry(row, int(element)))
+    for image, row, element in zip(Symmetry(group, agents)(batch, g), per_agent, g, strict=True):
+        assert_same(image.auto_batch_size_(1), single(row, int(element)))
 
 
 @every_symmetric_group
@@ -145,7 +156,7 @@ def test_mean_follows_the_action_and_scale_has_no_sign(parent):
 def test_scale_of_entries_that_mix_must_be_declared():
     group = PointGroup.rotation(3)
     batch = TensorDict(action=random(5, 2), scale=random(5, 2).exp(), batch_size=[5])
-    with pytest.raises(KeyError, match=r"the batch has 'scale', but .* mixes entries"):
+    with pytest.raises(KeyError, match=r"the batch has 'scale' .* mixes components"):
         Symmetry(group, {"action": planar(group)})(batch, 1)
     declared = Symmetry(group, {"action": planar(group), "scale": invariant(group, 2)})
     assert torch.equal(declared(batch, 1)["scale"], batch["scale"])
@@ -175,7 +186,7 @@ def test_unknown_entries_are_copied_when_not_strict(key):
 @pytest.mark.parametrize("shape", [(5, 3), (5,), (5, 4, 3)], ids=str)
 def test_wrong_sizes_are_refused(shape):
     batch = make_batch(5, observation=torch.zeros(shape))
-    with pytest.raises(ValueError, match=r"entry 'observation': expected a last dimension of 4, got shape"):
+    with pytest.raises(ValueError, match=r"entry 'observation': expected event dimensions \(4,\), got"):
         make_symmetry().orbit(batch)
 
 
@@ -334,9 +345,9 @@ def test_symmetric_boxes_pass(group, observation, action):
         ("C4", box([-1, -2], [1, 2]), r"entry 0, \[-1, 1\], .* 'rot-90', whose image there is \[-2, 2\]"),
         ("C3", UNIT, "'action': the box of entry 0, .* 'rot-120'.*make the box symmetric"),
         ("K4", box([-1, math.nan], [1, 1]), "'action': expected a box of numbers, got NaN in its bounds"),
-        ("K4", Unbounded(3), r"'action': the environment has shape \(3,\), expected a last dimension of 2"),
-        ("K4", Unbounded(()), r"'action': the environment has shape \(\), expected a last dimension of 2"),
-        ("K4", Categorical(3), r"'action': the environment has shape \(\), expected a last dimension of 2"),
+        ("K4", Unbounded(3), r"entry 'action': expected event dimensions \(2,\), got \(3,\)"),
+        ("K4", Unbounded(()), r"entry 'action': expected event dimensions \(2,\), got \(\)"),
+        ("K4", Categorical(3), r"entry 'action': expected event dimensions \(2,\), got \(\)"),
     ],
 )
 def test_asymmetric_actions_are_refused(group, action, message):
@@ -348,7 +359,7 @@ def test_asymmetric_actions_are_refused(group, action, message):
     "observation, message",
     [
         (box([-1] * 4, [1, 2, 1, 1]), "'observation': the box of entry 1"),
-        (Unbounded(3), r"'observation': the environment has shape \(3,\), expected a last dimension of 4"),
+        (Unbounded(3), r"entry 'observation': expected event dimensions \(4,\), got \(3,\)"),
     ],
 )
 def test_asymmetric_observations_are_refused(observation, message):
@@ -381,6 +392,6 @@ def test_nested_specs_are_found():
 
 def test_undeclared_specs_are_refused_unless_not_strict():
     env = SpecEnv({"observation": ANY, "heights": Unbounded(7)}, UNIT)
-    with pytest.raises(KeyError, match=r"'heights', which this symmetry does not know"):
+    with pytest.raises(KeyError, match=r"'heights'\], which this symmetry does not know"):
         make_symmetry().check_specs(env)
     make_symmetry(strict=False).check_specs(env)

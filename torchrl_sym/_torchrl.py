@@ -3,6 +3,10 @@
 TorchRL may change them in any release; ``tests/test_torchrl_contracts.py`` says what we expect of each.
 """
 
+from tensordict import NestedKey
+from torchrl.data import ReplayBuffer
+from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
+from torchrl.envs import EnvBase, SerialEnv
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
 )
@@ -10,4 +14,28 @@ from torchrl.objectives.ppo import (
     _check_advantage_broadcast as check_advantage_broadcast,
 )
 
-__all__ = ["broadcast_advantage_to_log_weight", "check_advantage_broadcast"]
+__all__ = [
+    "broadcast_advantage_to_log_weight",
+    "buffers_sampling_by",
+    "check_advantage_broadcast",
+    "cuts_by",
+    "serial_workers",
+]
+
+
+def serial_workers(env: SerialEnv) -> list[EnvBase]:
+    """The environments of a SerialEnv, one of each maker; they are made now, if they were not before."""
+    if env.is_closed:
+        env.start()
+    makers = [id(maker) for maker in env.create_env_fn]
+    return list(dict(zip(makers, env._envs, strict=True)).values())
+
+
+def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer]:
+    """The replay buffers of a storage that have a sample unit."""
+    return [buffer for buffer in storage._attached_entities if buffer._sample_unit is unit]
+
+
+def cuts_by(sampler: SliceSampler, key: NestedKey) -> bool:
+    """Whether a sampler takes slices between changes of this entry, wherever the storage has it."""
+    return sampler.traj_key == key or getattr(sampler, "_traj_key_auto", False)

@@ -175,7 +175,7 @@ def array(name: str, value: Any, finite: bool = True) -> Tensor:
     """Real numbers as a float64 tensor: a tensor, an array, nested lists."""
     try:
         is_complex = value.is_complex() if isinstance(value, Tensor) else np.iscomplexobj(value)
-        tensor = None if is_complex else torch.as_tensor(value, dtype=torch.float64)
+        tensor = None if is_complex else torch.as_tensor(value, dtype=torch.float64, device="cpu")
     except (TypeError, ValueError, RuntimeError):
         tensor = None
     if tensor is None:

@@ -72,7 +72,7 @@ class PointGroup:
             raise ValueError(f"expected matrices of shape (N, 3, 3), got {tuple(matrices.shape)}")
         if not 1 <= len(matrices) <= _MAX_ORDER:
             raise ValueError(f"expected 1 to {_MAX_ORDER} elements, got {len(matrices)}; list the identity")
-        eye = torch.eye(3, dtype=torch.float64)
+        eye = torch.eye(3, dtype=torch.float64, device="cpu")
         for i, matrix in enumerate(matrices):
             if not torch.allclose(matrix @ matrix.T, eye, rtol=0, atol=_TOLERANCE):
                 raise ValueError(
@@ -168,7 +168,7 @@ class PointGroup:
             >>> PointGroup.generate({"quarter turn": quarter}).names
             ('identity', 'rot-90', 'rot-180', 'rot-270')
         """
-        eye = torch.eye(3, dtype=torch.float64)
+        eye = torch.eye(3, dtype=torch.float64, device="cpu")
         moves = {}
         checks.flag("fixes_vertical", fixes_vertical)
         for name, value in checks.mapping("generators", generators, "names to matrices").items():
@@ -274,17 +274,17 @@ def check_group(group: Any) -> PointGroup:
 
 def _turn(angle: float) -> Tensor:
     c, s = math.cos(angle), math.sin(angle)
-    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64, device="cpu")
 
 
 def _mirror(nx: float, ny: float) -> Tensor:
-    normal = torch.tensor([nx, ny, 0.0], dtype=torch.float64)
-    return torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
+    normal = torch.tensor([nx, ny, 0.0], dtype=torch.float64, device="cpu")
+    return torch.eye(3, dtype=torch.float64, device="cpu") - 2 * torch.outer(normal, normal)
 
 
 def _snap(matrices: Tensor) -> Tensor:
     """Replace entries within 1e-9 of 0, 1/2, sqrt(1/2), sqrt(3/4) or 1 by that number, exactly."""
-    exact = torch.tensor(_EXACT, dtype=torch.float64)
+    exact = torch.tensor(_EXACT, dtype=torch.float64, device="cpu")
     distance, nearest = (matrices[..., None] - exact).abs().min(dim=-1)
     return torch.where(distance < _TOLERANCE, exact[nearest], matrices)
 
@@ -301,7 +301,7 @@ def _planar_angle(matrix: Tensor) -> tuple[float, float] | None:
 
 
 def _name(matrix: Tensor, fallback: str | None = None) -> str:
-    if torch.equal(matrix, torch.eye(3, dtype=matrix.dtype)):
+    if torch.equal(matrix, torch.eye(3, dtype=matrix.dtype, device="cpu")):
         return "identity"
     planar = _planar_angle(matrix)
     if planar is None:
@@ -315,7 +315,7 @@ def _name(matrix: Tensor, fallback: str | None = None) -> str:
 def _sort_key(matrix: Tensor) -> tuple:
     """Identity, reflections, turns, each by angle: for K_4 this is the order of the paper's table."""
     planar = _planar_angle(matrix)
-    if torch.equal(matrix, torch.eye(3, dtype=matrix.dtype)):
+    if torch.equal(matrix, torch.eye(3, dtype=matrix.dtype, device="cpu")):
         return (0, 0.0)
     if planar is None:
         return (3, *matrix.flatten().tolist())

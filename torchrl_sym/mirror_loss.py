@@ -6,25 +6,70 @@ Eq. (symm-loss) of Mittal et al., after Yu, Turk and Liu 2018::
 
 where K_g[pi(s)] is a label: gradients flow through pi(L_g[s]) only. The loss stands on its own, so that
 it goes beside any other objective (PPO, SAC, TD3), and under ``torch.no_grad`` it is the paper's
-symmetry metric.
+symmetry metric. The same equation holds for a critic, whose value no element changes:
+V(L_g[s]) = V(s) and Q(L_g[s], K_g[a]) = Q(s, a).
 """
 
 from __future__ import annotations
 
-import contextlib
-import copy
+import functools
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import TensorDictModule, TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModule, dispatch
 from torch import Tensor
-from torchrl.modules import OneHotCategorical
 from torchrl.objectives import LossModule
 
 from torchrl_sym import checks
-from torchrl_sym.representations import Representation, invariant
+from torchrl_sym.memory import Memory
+from torchrl_sym.networks import Effect, HeldNetwork, check_network, evaluating, inputs
+from torchrl_sym.outputs import compared, deterministic_action, is_q_function, output_key, own_keys
+from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry, check_symmetry
+
+
+def mirror_error(
+    output: Tensor,
+    source: Tensor,
+    act: Representation | None,
+    g: Sequence[int] | Tensor,
+    *,
+    stop_gradient: bool = True,
+) -> Tensor:
+    """The terms || K_g[pi(s)] - pi(L_g[s]) ||^2 of Eq. (symm-loss).
+
+    Args:
+        output: pi(L_g[s]): ``(n, *B, *event)`` for n elements, ``(*B, *event)`` for one element per row.
+        source: pi(s), from the original rows: ``(*B, *event)``.
+        act: K_g; None for a vector that no element changes, such as a value.
+        g: indices of the n elements, or of each row's element, ``(*B,)``.
+        stop_gradient: treat K_g[pi(s)] as a label.
+
+    Returns:
+        ``(n, *B)``, of which the loss of a row is the sum over the elements; or ``(*B,)``, of which N times
+        the mean over uniformly drawn elements is that sum.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_sym import PointGroup
+        >>> from torchrl_sym.representations import pseudoscalar
+        >>> sign = pseudoscalar(PointGroup.reflection("x"))
+        >>> mirror_error(torch.tensor([[2.0], [1.0]]), torch.tensor([2.0]), sign, [0, 1])
+        tensor([0., 9.])
+    """
+    with torch.set_grad_enabled(torch.is_grad_enabled() and not stop_gradient):
+        if act is None:
+            label = source
+        elif isinstance(g, Tensor):
+            label = act.per_row(source, g)
+        else:
+            label = torch.stack([act(source, element) for element in g])
+    dims = 1 if act is None else len(act.event_shape)
+    return (output - label).pow(2).sum(tuple(range(-dims, 0)))
 
 
 class MirrorLoss(LossModule):
@@ -34,11 +79,17 @@ class MirrorLoss(LossModule):
     ``reduction``. Implementations that average over copies and entries instead (rsl_rl) need the weight
     ``w_rsl = w * (N - 1) * action_dim`` for the same gradient.
 
-    The deterministic action is compared (mean of a Gaussian, squashed mean of a TanhNormal). A
-    deterministic policy works as well, and so does a critic, whose value must be invariant.
+    What a network writes is compared as it transforms: the deterministic action (mean of a Gaussian,
+    squashed mean of a TanhNormal, probabilities of one-hot actions); the vector of action values of a
+    ``QValueActor`` or of a discrete Q function, like a one-hot action; the values V(s) and Q(s, a), which
+    no element changes. Networks are evaluated without dropout and by running statistics, so that the loss
+    of an exactly symmetric one is zero.
+
+    A loss that expands a network (SAC, TD3, REDQ, CrossQ, IQL, CQL) trains parameters of its own:
+    :meth:`of` reaches them.
 
     Args:
-        actor_network: probabilistic actor, or a module that writes the action or the state value.
+        actor_network: probabilistic actor, or a module that writes the action or a value.
 
     Keyword Args:
         symmetry: what transforms how; must declare everything that the network reads.
@@ -46,12 +97,20 @@ class MirrorLoss(LossModule):
         stop_gradient: treat K_g[pi(s)] as a label. Defaults to ``True``, as in the paper.
         reduction: ``"mean"`` (default), ``"sum"`` or ``"none"`` over the batch.
         per_element: also return ``mirror_error``, the unweighted error of each element, ``(N,)``.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and do not count. Defaults to 0: such
+            sequences are refused.
         functional: as in other TorchRL losses. Defaults to ``True``.
+
+    Attributes:
+        patience: number of gradients that may be added up in the network's parameters before somebody
+            clears them or changes the parameters, 100; more is an error, for then no optimizer holds them.
 
     Raises:
         KeyError: the network reads or writes a key that the symmetry does not declare.
-        ValueError: a weight or a reduction that is none.
+        ValueError: a weight or a reduction that is none; action values of a signed action.
         TypeError: an argument of another type, or of a name that is not above.
+        RuntimeError: when called, if the loss cannot move the network's trainable parameters.
 
     Example:
         >>> import torch
@@ -73,10 +132,14 @@ class MirrorLoss(LossModule):
 
         Attributes:
             action: the action, or the action of a deterministic policy. Defaults to ``"action"``.
+            action_value: one value for each discrete action. Defaults to ``"action_value"``.
+            state_action_value: the output of Q(s, a). Defaults to ``"state_action_value"``.
             value: the output of a critic. Defaults to ``"state_value"``.
         """
 
         action: NestedKey = "action"
+        action_value: NestedKey = "action_value"
+        state_action_value: NestedKey = "state_action_value"
         value: NestedKey = "state_value"
 
     default_keys = _AcceptedKeys
@@ -85,6 +148,7 @@ class MirrorLoss(LossModule):
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
     coeff: Tensor
+    patience: int = 100
     _schedulable_buffers = frozenset({"coeff"})
 
     @checks.near_names
@@ -97,30 +161,95 @@ class MirrorLoss(LossModule):
         stop_gradient: bool = True,
         reduction: str | None = None,
         per_element: bool = False,
+        burn_in: int = 0,
         functional: bool = True,
     ) -> None:
-        check_network("actor_network", actor_network)
+        borrowed = isinstance(actor_network, HeldNetwork)  # of another loss
+        if not borrowed:
+            check_network("actor_network", actor_network)
         check_symmetry(symmetry)
         checks.real("coeff", coeff, 0.0)
         self._functional = checks.flag("functional", functional)
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
+        self._compared: tuple[NestedKey, Representation | None] | None = None
         super().__init__()
-        if functional:
-            self.convert_to_functional(actor_network, "actor_network")
-        else:
-            self.actor_network = actor_network
-            self.actor_network_params = None  # type: ignore[assignment]
-        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
+        self._held = self._borrow(actor_network) if borrowed else self._hold(actor_network)
+        self._effect = Effect(self._held)
+        self.symmetry = symmetry
         self.stop_gradient = checks.flag("stop_gradient", stop_gradient)
         self.per_element = checks.flag("per_element", per_element)
         reduction = "mean" if reduction is None else reduction
         self.reduction = checks.one_of("reduction", reduction, ("none", "mean", "sum"))
-        self.register_coeff_buffer("coeff", coeff)
-        self._follow_network()
-        if self._is_policy():  # any other output may still be named with set_keys
-            self._output_representation()
-        symmetry.require(actor_network.in_keys, "the network")
+        device = next((p.device for p in self._held.parameters()), torch.device("cpu"))
+        self.register_coeff_buffer("coeff", coeff, device=device)
+        self.set_keys(**own_keys(self.actor_network, symmetry, self.tensor_keys))
+        if output_key(self.actor_network, self.tensor_keys):  # else it may still be named with set_keys
+            self._find_output()
+        copies = symmetry.group.order > 1
+        self.memory = Memory.of(symmetry, [self.actor_network], burn_in=burn_in, copies=copies)
+        symmetry.require(self.in_keys, "the network")
+
+    @classmethod
+    def of(cls, loss: LossModule, network: str = "qvalue_network", **options: Any) -> MirrorLoss:
+        """Mirror loss of a network inside a loss, through the parameters which that loss trains.
+
+        Nothing is registered twice: the mirror loss has no parameter of its own, in ``parameters()`` or in
+        the ``state_dict``, and target networks are left alone. The loss of an ensemble is the sum over its
+        members, like the temporal-difference losses beside it: each member has the gradient that it would
+        have alone. The label of a copy comes from the same member's value of the original. Set keys of the
+        loss before.
+
+        Two mirror losses beside one objective both write ``loss_mirror``: add them up.
+
+        Args:
+            loss: any loss of TorchRL, with its networks.
+            network: the name under which the loss keeps it, such as ``"qvalue_network"``,
+                ``"actor_network"``, ``"value_network"`` or ``"critic_network"``.
+            **options: those of :class:`MirrorLoss`, without ``functional``.
+
+        Raises:
+            ValueError: the loss has no such network; the message lists those it has.
+            TypeError: no loss, or a name that is no option.
+
+        Example:
+            >>> import torch
+            >>> from tensordict import TensorDict
+            >>> from tensordict.nn import TensorDictModule
+            >>> from torch import nn
+            >>> from torchrl.modules import MLP, ValueOperator
+            >>> from torchrl.objectives import TD3Loss
+            >>> from torchrl_sym import MirrorLoss, PointGroup, Symmetry
+            >>> from torchrl_sym.representations import pseudoscalar
+            >>> group = PointGroup.reflection("x")
+            >>> sign = pseudoscalar(group)
+            >>> symmetry = Symmetry(group, {"observation": sign * 3, "action": sign})
+            >>> actor = TensorDictModule(nn.Linear(3, 1), in_keys=["observation"], out_keys=["action"])
+            >>> qvalue = ValueOperator(MLP(4, 1, num_cells=[8]), in_keys=["observation", "action"])
+            >>> objective = TD3Loss(actor, qvalue, bounds=(-1.0, 1.0))
+            >>> mirror = MirrorLoss.of(objective, "qvalue_network", symmetry=symmetry)
+            >>> batch = TensorDict(observation=torch.randn(8, 3), action=torch.randn(8, 1), batch_size=[8])
+            >>> mirror(batch)["loss_mirror"].backward()
+            >>> objective.qvalue_network_params["module", "0", "weight"].grad.shape  # of both members
+            torch.Size([2, 8, 4])
+        """
+        accepted = [name for name in checks.keywords(cls) if name not in ("actor_network", "functional")]
+        checks.refuse_unknown(f"{cls.__name__}.of", options, accepted)
+        return cls(HeldNetwork.inside(loss, network), functional=False, **options)  # pyright: ignore[reportArgumentType]
+
+    def _hold(self, network: TensorDictModule) -> HeldNetwork:
+        if not self.functional:
+            self.actor_network = network
+            self.actor_network_params = None  # type: ignore[assignment]
+            return HeldNetwork(network)
+        self.convert_to_functional(network, "actor_network")
+        return HeldNetwork(network, self.actor_network_params)
+
+    def _borrow(self, inside: HeldNetwork) -> HeldNetwork:
+        vars(self)["actor_network"] = inside.module  # not registered: its parameters are another's
+        known = self._AcceptedKeys.__dataclass_fields__
+        self.set_keys(**{name: key for name, key in inside.keys.items() if name in known})
+        return inside
 
     @property
     def functional(self) -> bool:
@@ -128,13 +257,13 @@ class MirrorLoss(LossModule):
         return self._functional
 
     def _forward_value_estimator_keys(self, **kwargs) -> None:
-        self._in_keys = None
+        self._in_keys = self._compared = None
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """What the network reads."""
         if self._in_keys is None:
-            self._in_keys = list(self.actor_network.in_keys)
+            self._in_keys = inputs(self.actor_network)
         return self._in_keys
 
     @in_keys.setter
@@ -153,111 +282,78 @@ class MirrorLoss(LossModule):
     def out_keys(self, values: list[NestedKey]) -> None:
         self._out_keys = values
 
-    def _follow_network(self) -> None:
-        """Take over the key of the action that the network writes, where it can be told."""
-        network, keys = self.actor_network, self.tensor_keys
-        written = network.out_keys
-        if hasattr(network, "dist_sample_keys"):
-            self.set_keys(action=single_action(network))
-        elif keys.action not in written and keys.value not in written:
-            declared = set(self.symmetry.keys()) & set(written) - set(network.in_keys)
-            if len(declared) == 1:
-                self.set_keys(action=declared.pop())
-
-    def _is_policy(self) -> bool:
-        network = self.actor_network
-        return self.tensor_keys.action in network.out_keys or hasattr(network, "get_dist")
-
-    def _output_representation(self) -> Representation:
-        """K_g of what the network puts out; a critic's value is invariant."""
-        written = self.actor_network.out_keys
-        if self._is_policy():
-            return self.symmetry[self.tensor_keys.action]
-        if self.tensor_keys.value in written:
-            return invariant(self.symmetry.group, 1)
-        raise KeyError(
-            f"the network writes {written}, neither the action {self.tensor_keys.action!r} nor the value "
-            f"{self.tensor_keys.value!r}; name its output with set_keys(action=...) or set_keys(value=...)"
-        )
+    def _find_output(self) -> tuple[NestedKey, Representation | None]:
+        """Key of what is compared, and K_g; found once for each choice of keys."""
+        if self._compared is None:
+            network, keys = self.actor_network, self.tensor_keys
+            self._compared = compared(network, self.symmetry, keys)
+            if not self._held.borrowed and is_q_function(network, keys):
+                warnings.warn(_COPIES, UserWarning, stacklevel=3)
+        return self._compared
 
     def _output(self, tensordict: TensorDictBase) -> Tensor:
-        with (
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
-            if self.functional
-            else contextlib.nullcontext()
-        ):
-            if hasattr(self.actor_network, "get_dist"):
-                return deterministic_action(self.actor_network.get_dist(tensordict))
-            out = self.actor_network(tensordict)
-        key = self.tensor_keys.action
-        return out.get(key if key in self.actor_network.out_keys else self.tensor_keys.value)
+        """What is compared, of rows ``[*B]``."""
+        if hasattr(self.actor_network, "get_dist"):
+            return deterministic_action(self.actor_network.get_dist(tensordict))
+        key, _ = self._find_output()
+        out = self.actor_network(tensordict).get(key)
+        if out.ndim <= tensordict.batch_dims:
+            raise ValueError(
+                f"expected {key!r} of a shape that continues the batch size "
+                f"{tuple(tensordict.batch_size)}, such as (*B, 1), got {tuple(out.shape)}"
+            )
+        return out
+
+    def _error(self, orbit: TensorDictBase) -> Tensor:
+        """Error of each element, that of the identity left out where it is not needed."""
+        _, act = self._find_output()
+        elements = range(len(orbit))
+        if self.stop_gradient and len(orbit) > 1:
+            with torch.no_grad():
+                source = self._output(orbit[0])
+            return mirror_error(self._images(orbit[1:]), source, act, elements[1:])
+        output = self._images(orbit)
+        return mirror_error(output, output[0], act, elements, stop_gradient=self.stop_gradient)
+
+    def _images(self, orbit: TensorDictBase) -> Tensor:
+        """What is compared, of ``[n, *B]``; as rows, since many networks take no more dimensions."""
+        rows = orbit.reshape(-1, *orbit.batch_size[2:])
+        return self._output(rows).unflatten(0, orbit.batch_size[:2])
 
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute ``loss_mirror``; the input is not modified."""
-        state = batched(tensordict.select(*self.actor_network.in_keys, strict=False), self.in_keys[0])
-        orbit = self.symmetry.orbit(state)  # [N, *B], identity first
-        act = self._output_representation()
-        if self.stop_gradient and len(orbit) > 1:
-            with torch.no_grad():
-                label = act.orbit(self._output(orbit[0]))  # K_g[pi(s)]
-            error = squared_distance(self._output(orbit[1:]), label[1:])  # (N - 1, *B)
-        else:
-            output = self._output(orbit)
-            label = act.orbit(output[0])
-            label = label.detach() if self.stop_gradient else label
-            error = squared_distance(output, label)  # (N, *B), zero for the identity
-        td_out = TensorDict(loss_mirror=self.coeff * error.sum(0))
+        tensordict = batched(tensordict.clone(False), self.in_keys[0], self.symmetry)
+        tensordict = self.memory.prepare(tensordict, self._loss_mask_keys())
+        state = tensordict.select(*self.symmetry.together(self.in_keys), strict=False)
+        orbit = self.memory.rebuild(self.symmetry.orbit(state))  # [N, *B], identity first
+        with evaluating(self.actor_network):
+            members = self._held.each(lambda: self._error(orbit))
+        error = functools.reduce(torch.add, members)  # (N or N - 1, *B)
+        self._effect.require(error, self.patience)
+
+        loss = self.coeff * error.sum(0)
+        td_out = TensorDict(loss_mirror=self._reduce_loss(loss, tensordict))
         if self.per_element:
-            per_element = error.detach().flatten(1).mean(1)
-            td_out.set("mirror_error", torch.cat([per_element.new_zeros(1), per_element])[-len(orbit) :])
-        td_out = td_out.named_apply(
-            lambda name, value: self._reduce_loss(value, tensordict) if name.startswith("loss_") else value
-        )
-        self._clear_weakrefs(td_out, "actor_network_params", "target_actor_network_params")
+            rows = [self._reduce_loss(row, tensordict, reduction="mean") for row in error.detach()]
+            identity = [torch.zeros_like(rows[0])] * (len(orbit) - len(rows))
+            td_out.set("mirror_error", torch.stack([*identity, *rows]))
+        self._clear_weakrefs(td_out, self._held.params)
         return td_out
 
 
-def check_network(name: str, network: TensorDictModule) -> None:
-    """TypeError unless a network reads and writes tensordicts."""
-    remedy = "wrap a network in TensorDictModule, ProbabilisticActor or ValueOperator"
-    checks.instance(name, network, TensorDictModuleBase, remedy)
+# A network of this kind is often that of a loss which trains copies of it.
+_COPIES = (
+    "MirrorLoss has been given a Q function. SACLoss, TD3Loss, REDQLoss, CrossQLoss, IQLLoss, CQLLoss and "
+    "DiscreteSACLoss train copies of the one that they are given, which a mirror loss on the original does "
+    "not reach: use MirrorLoss.of(loss, 'qvalue_network', symmetry=...)"
+)
 
 
-def single_action(actor: TensorDictModule) -> NestedKey:
-    """Key of the action that a probabilistic actor samples.
-
-    Raises:
-        ValueError: the actor has several action heads, for which no distance is defined.
-    """
-    keys = actor.dist_sample_keys
-    if len(keys) != 1:
-        raise ValueError(f"the mirror loss compares one action, got an actor with {keys}; join its heads")
-    return keys[0]
-
-
-def deterministic_action(dist: torch.distributions.Distribution) -> Tensor:
-    """The action pi(s) of a distribution: its deterministic sample, or its mean."""
-    if isinstance(dist, OneHotCategorical | torch.distributions.OneHotCategorical):
-        return dist.probs  # the mode has no gradient; a permutation maps the probabilities alike
-    if isinstance(dist, torch.distributions.Categorical):
-        raise TypeError(
-            "expected an action that a representation can map, got an integer from a Categorical; use "
-            "one-hot actions (OneHotCategorical) with a permutation"
-        )
-    sample = getattr(dist, "deterministic_sample", None)
-    return dist.mean if sample is None else sample
-
-
-def squared_distance(output: Tensor, label: Tensor) -> Tensor:
-    """Sum of squared differences over the last dimension."""
-    return (output - label).pow(2).sum(-1)
-
-
-def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
+def batched(tensordict: TensorDictBase, key: NestedKey, symmetry: Symmetry) -> TensorDictBase:
     """Give a tensordict that a keyword call has built the batch size of one of its entries.
 
-    ``dispatch`` takes the longest shape that all entries share, at times with their last dimension.
+    ``dispatch`` takes the longest shape that all entries share, at times with event dimensions.
     """
     value = tensordict.get(key, None)
     if value is None:
@@ -265,6 +361,9 @@ def batched(tensordict: TensorDictBase, key: NestedKey) -> TensorDictBase:
             f"expected an entry {key!r}, which the network reads; the batch has "
             f"{sorted(map(str, tensordict.keys(include_nested=True, leaves_only=True)))}"
         )
-    if tensordict.batch_dims in (0, value.ndim):
-        tensordict.batch_size = value.shape[:-1]  # pyright: ignore[reportAttributeAccessIssue]
+    if isinstance(value, TensorDictBase):
+        return tensordict  # a group, whose own size does not tell
+    size = value.shape[: value.ndim - symmetry.event_dims(key)]
+    if tensordict.batch_dims == 0 or tensordict.batch_dims > len(size):
+        tensordict.batch_size = size  # pyright: ignore[reportAttributeAccessIssue]
     return tensordict

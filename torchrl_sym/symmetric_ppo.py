@@ -11,27 +11,30 @@ naive augmentation, whose denominator pi_k(K_g[a] | L_g[s]) can be arbitrarily s
 from __future__ import annotations
 
 import contextlib
-import copy
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, is_tensor_collection
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
+from tensordict.nn import (
+    CompositeDistribution,
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    dispatch,
+)
 from tensordict.utils import unravel_key
 from torch import Tensor
+from torchrl.modules.distributions.utils import has_analytic_entropy
 from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.utils import distance_loss
 
 from torchrl_sym import checks
 from torchrl_sym._torchrl import broadcast_advantage_to_log_weight, check_advantage_broadcast
-from torchrl_sym.mirror_loss import (
-    batched,
-    check_network,
-    deterministic_action,
-    single_action,
-    squared_distance,
-)
-from torchrl_sym.rows import DrawnRows, OrbitRows
+from torchrl_sym.memory import Memory
+from torchrl_sym.mirror_loss import batched, mirror_error
+from torchrl_sym.networks import check_network, inputs
+from torchrl_sym.orbits import Copies, variance
+from torchrl_sym.outputs import deterministic_action, single_action
 from torchrl_sym.symmetry import Elements, Symmetry, check_symmetry
 
 # Numbers of ClipPPOLoss and the least they may be; a negative weight of the entropy has its uses.
@@ -63,12 +66,16 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         mirror_coeff: weight w of the mirror loss (Eq. symm-loss), finite and not negative, added as
             ``loss_mirror``; it reuses the actor's pass over the orbit. 0 leaves it out. Schedulable when
             positive.
+        burn_in: for recurrent networks: the first steps of a sequence that begins with a stored memory
+            other than zero, which rebuild the copies' memory and count neither for them nor for their
+            originals. Defaults to 0: such sequences are refused.
         **clip_ppo_kwargs: everything ``ClipPPOLoss`` accepts, and nothing that it would ignore.
 
     Raises:
         KeyError: a network reads a key, or the action is one, that the symmetry does not declare; or
             there is no such element.
-        ValueError: a number that is not finite or out of range.
+        ValueError: a number that is not finite or out of range; in a call, sequences whose copies would
+            begin from a wrong memory.
         TypeError: an argument of another type, or of a name that neither loss knows.
 
     Example:
@@ -105,6 +112,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
     """
 
     mirror_coeff: Tensor
+    entropy_coeff: Tensor
+    critic_coeff: Tensor
+    clip_value: Tensor | None
 
     def __init__(
         self,
@@ -114,6 +124,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         symmetry: Symmetry,
         elements: Elements = "all",
         mirror_coeff: float = 0.0,
+        burn_in: int = 0,
         **clip_ppo_kwargs,
     ) -> None:
         check_symmetry(symmetry)
@@ -132,13 +143,18 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         # afterwards, for TorchRL has messages of its own for names that it has removed
         accepted = checks.keywords(SymmetricClipPPOLoss)
         checks.refuse_unknown(type(self).__name__, clip_ppo_kwargs, accepted)
-        self.symmetry = copy.deepcopy(symmetry)  # to(device) must not move the caller's
+        self.symmetry = symmetry
         self.random = elements == "random" and symmetry.group.order > 1  # else there is nothing to draw
         self.elements = symmetry.elements(elements)
         self._mirrors = mirror_coeff > 0
+        # decided here: a number on an accelerator could not be asked without waiting for it
+        self._clips_value = self.clip_value is not None and bool(self.clip_value)
         if self._mirrors:
-            self.register_coeff_buffer("mirror_coeff", mirror_coeff)
+            self.register_coeff_buffer("mirror_coeff", mirror_coeff, device=self.entropy_coeff.device)
             single_action(self.actor_network)
+        networks = (self.actor_network, self.critic_network)
+        copies = len(self.elements) > 1
+        self.memory = Memory.of(self.symmetry, networks, burn_in=burn_in, copies=copies)
         self._require_keys()
 
     _schedulable_buffers = ClipPPOLoss._schedulable_buffers | {"mirror_coeff"}
@@ -169,14 +185,19 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
     @dispatch  # pyright: ignore[reportArgumentType]
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Compute the losses; the input is not modified."""
-        td = batched(tensordict.clone(False), self.actor_network.in_keys[0])
+        td = batched(tensordict.clone(False), self.actor_network.in_keys[0], self.symmetry)
         self._prepare_advantage(td)
+        td = self.memory.prepare(td, self._loss_mask_keys())
         td = td.select(*self._read_keys(), strict=False)
-        mapped = self._mapped_keys()
-        if self.random:
-            rows = DrawnRows(self.symmetry, td, mapped)
-        else:
-            rows = OrbitRows(self.symmetry, self.elements, td, mapped)
+        rows = Copies(
+            self.symmetry,
+            td,
+            self._mapped_keys(),
+            self._followers(),
+            None if self.random else self.elements,
+            memory=self.memory,
+            mask_keys=self._loss_mask_keys(),
+        )
         advantage = rows.expanded.get(self.tensor_keys.advantage)
 
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
@@ -195,15 +216,9 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         with torch.no_grad():
             rows.report(td_out, kl_approx, (clipped != log_weight).to(gain.dtype), behaviour)
         if self.entropy_bonus:
-            entropy = rows.originals(self._get_entropy(dist, adv_shape=advantage.shape[:-1]))
-            self._report_entropy(td_out, entropy)
+            self._report_entropy(td_out, self._get_entropy(dist, adv_shape=advantage.shape[:-1]), rows)
         if self._has_critic:
-            loss_critic, value_clip_fraction, explained_variance = self.loss_critic(rows.expanded)
-            td_out.set("loss_critic", loss_critic)
-            if value_clip_fraction is not None:
-                td_out.set("value_clip_fraction", value_clip_fraction)
-            if explained_variance is not None:
-                td_out.set("explained_variance", explained_variance)
+            self._report_critic(td_out, rows)
         if self._mirrors:
             td_out.set("loss_mirror", self.mirror_coeff * self._mirror_error(rows, dist))
         td_out = td_out.named_apply(lambda name, value: self._reduce(name, value, rows))
@@ -239,46 +254,100 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         return [key for key in _inputs(self.critic_network) if unravel_key(key) not in written]
 
     def _mapped_keys(self) -> list[NestedKey]:
-        """What differs between symmetric copies; they share the rest of what the loss reads."""
+        """What may differ between symmetric copies; they share the rest of what the loss reads."""
         networks = [*_inputs(self.actor_network), *self._critic_inputs()]
-        return [*networks, *_as_list(self.tensor_keys.action)]
+        return self.symmetry.together([*networks, *_as_list(self.tensor_keys.action), *self._followers()])
+
+    def _followers(self) -> dict[NestedKey, NestedKey]:
+        """Numbers of a row, or of the components of its action, and that action."""
+        keys = self.tensor_keys
+        actions = _as_list(keys.action)
+        numbers = [keys.advantage, keys.value_target, *([keys.value] if self._clips_value else [])]
+        probabilities = _as_list(keys.sample_log_prob)
+        each = zip(probabilities, actions, strict=False) if len(probabilities) > 1 else []
+        return dict.fromkeys([*numbers, *probabilities], actions[0]) | dict(each)
 
     def _read_keys(self) -> list[NestedKey]:
-        keys = self.tensor_keys
-        read = [*self._mapped_keys(), *self._loss_mask_keys(), *_as_list(keys.sample_log_prob)]
-        read += [keys.advantage, keys.value_target]
-        return read if self.clip_value is None else [*read, keys.value]
+        return [*self._mapped_keys(), *self._loss_mask_keys()]
 
-    def _report_entropy(self, td_out: TensorDictBase, entropy: Tensor | TensorDictBase) -> None:
+    def _get_entropy(self, dist: torch.distributions.Distribution, adv_shape: torch.Size):
+        """The entropy; without a look, which the host would wait for, whether it is finite."""
+        if isinstance(dist, CompositeDistribution) or not has_analytic_entropy(dist):
+            return super()._get_entropy(dist, adv_shape)
+        return dist.entropy().unsqueeze(-1)
+
+    def _report_entropy(
+        self, td_out: TensorDictBase, entropy: Tensor | TensorDictBase, rows: Copies
+    ) -> None:
         total = entropy
         if is_tensor_collection(entropy):  # one entropy per action head
-            td_out.set("composite_entropy", entropy.detach())
+            td_out.set("composite_entropy", rows.originals(entropy.detach()))
             total = entropy.sum(dim="feature", reduce=True)  # pyright: ignore[reportCallIssue]
-        td_out.set("entropy", total.detach().mean())
-        td_out.set("loss_entropy", self._weighted_loss_entropy(entropy))
+        td_out.set("entropy", rows.mean(total.detach()))
+        td_out.set("loss_entropy", self._weighted_loss_entropy(rows.originals(entropy)))
 
-    def _mirror_error(self, rows: OrbitRows | DrawnRows, dist: torch.distributions.Distribution) -> Tensor:
-        """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
-        act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
-        output = deterministic_action(dist)  # pi(L_g s)
-        if isinstance(rows, DrawnRows):  # each row is one term of the sum, drawn with probability 1/N
-            with torch.no_grad():
-                label = act(deterministic_action(self._distribution(rows.td)), rows.element)
-            return len(self.elements) * squared_distance(output, label).unsqueeze(-1)
-        output = output.unflatten(0, (len(self.elements), -1))
-        with torch.no_grad():
-            label = torch.stack([act(output[0], g) for g in self.elements])
-        return squared_distance(output, label).sum(0).unsqueeze(-1)
+    def _report_critic(self, td_out: TensorDictBase, rows: Copies) -> None:
+        """Value loss of all rows; what was clipped, and the variance explained, of those that count."""
+        td = rows.expanded.detach() if self.separate_losses else rows.expanded
+        keys = self.tensor_keys
+        target, old = td.get(keys.value_target, None), td.get(keys.value, None)
+        if target is None:
+            raise KeyError(f"expected {keys.value_target!r} in the batch, which a value estimator writes")
+        if self._clips_value and old is None:  # in the words of ClipPPOLoss
+            raise KeyError(
+                f"clip_value is set to {self.clip_value}, but the key {keys.value} was not found in the "
+                "input tensordict. Make sure that the 'value' key passed to PPO exists in the input "
+                "tensordict, where a value estimator writes it."
+            )
+        with self._using("critic_network"):
+            value = self.critic_network(td).get(keys.value, None)
+        if value is None:
+            raise KeyError(
+                f"expected the critic to write {keys.value!r}, it writes {self.critic_network.out_keys}"
+            )
+        target, value, old = self._critic_loss_inputs(target, value, old)
 
-    def _distribution(self, td: TensorDictBase) -> torch.distributions.Distribution:
+        loss = distance_loss(target, value, loss_function=self.loss_critic_type)
+        if old is not None and self.clip_value is not None and self._clips_value:
+            change = value - old
+            bounded = change.clamp(-self.clip_value, self.clip_value)
+            other = distance_loss(target, old + bounded, loss_function=self.loss_critic_type)
+            loss = torch.maximum(loss, other)
+            clipped = (change.detach() != bounded.detach()).to(value.dtype)
+            td_out.set("value_clip_fraction", rows.overall_mean(clipped))
+        td_out.set("loss_critic", self.critic_coeff * loss)
+
+        if self.log_explained_variance:
+            target, value = target.detach(), value.detach()
+            total = variance(target, rows.valid) + torch.finfo(target.dtype).eps
+            td_out.set("explained_variance", 1.0 - variance(target - value, rows.valid) / total)
+
+    @contextlib.contextmanager
+    def _using(self, network: str) -> Iterator[None]:
+        """With the loss's own parameters in a network."""
         with (
-            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False)
+            getattr(self, f"{network}_params").to_module(
+                getattr(self, network), preserve_module_state=False
+            )
             if self.functional
             else contextlib.nullcontext()
         ):
-            return self.actor_network.get_dist(td)
+            yield
 
-    def _reduce(self, name: str, value: Tensor, rows: OrbitRows | DrawnRows) -> Tensor:
+    def _mirror_error(self, rows: Copies, dist: torch.distributions.Distribution) -> Tensor:
+        """sum_g || K_g[pi(s)] - pi(L_g s) ||^2 per original row, the label detached."""
+        act = self.symmetry[_as_list(self.tensor_keys.action)[0]]
+        output = deterministic_action(dist)  # pi(L_g s)
+        if rows.element is None:
+            output = output.unflatten(0, (rows.count, -1))
+            return mirror_error(output, output[0], act, self.elements).sum(0).unsqueeze(-1)
+
+        with torch.no_grad(), self._using("actor_network"):
+            source = deterministic_action(self.actor_network.get_dist(rows.td))
+        # each row is one term of the sum, drawn with probability 1/N
+        return rows.count * mirror_error(output, source, act, rows.element).unsqueeze(-1)
+
+    def _reduce(self, name: str, value: Tensor, rows: Copies) -> Tensor:
         if not name.startswith("loss_"):
             return value
         per_original = name in ("loss_entropy", "loss_mirror")
@@ -291,13 +360,16 @@ def _check_numbers(arguments: Mapping[str, Any]) -> None:
         value = arguments[name]
         if (value is None and name != "clip_epsilon") or (name == "clip_value" and isinstance(value, bool)):
             continue  # a default, or the bound of the ratio
-        parts = [value]
-        if name == "clip_epsilon" and isinstance(value, tuple | list) and len(value) == 2:
-            parts = list(value)  # below and above
+        least, parts = _LEAST[name], [value]
+        if name == "clip_epsilon" and isinstance(value, tuple | list):
+            if len(value) != 2:
+                shown = checks.shown(value)
+                raise ValueError(f"{name}: expected a number, or two as a tuple of length 2, got {shown}")
+            least, parts = None, list(value)  # below and above, whose signs ClipPPOLoss checks
         if name == "entropy_coeff" and isinstance(value, Mapping):
             parts = list(value.values())  # one for each head
         for part in parts:
-            checks.real(name, part, _LEAST[name])
+            checks.real(name, part, least)
 
 
 def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
@@ -307,9 +379,4 @@ def _as_list(keys: NestedKey | list[NestedKey] | None) -> list[NestedKey]:
 
 
 def _inputs(network: TensorDictModule | None) -> list[NestedKey]:
-    """What a network reads from the batch; not the group of parameters that its own modules fill."""
-    if network is None:
-        return []
-    written = [key for key in network.out_keys if isinstance(key, tuple)]
-    filled = {unravel_key(key[:depth]) for key in written for depth in range(1, len(key))}
-    return [key for key in network.in_keys if unravel_key(key) not in filled]
+    return [] if network is None else inputs(network)

@@ -8,33 +8,26 @@ left un-mirrored is the most common bug of this field.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import torch
-from tensordict import NestedKey, TensorDictBase, is_tensor_collection
-from tensordict.utils import unravel_key
+from tensordict import NestedKey, TensorDictBase, is_leaf_nontensor, is_tensor_collection
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from torchrl_sym import checks
+from torchrl_sym.declaration import Declaration, require_even
+from torchrl_sym.entries import PER_ROW as _INVARIANT
+from torchrl_sym.entries import Exchanged, enclosing, split, without_next
 from torchrl_sym.groups import PointGroup, check_group
+from torchrl_sym.probing import check_transforms
 from torchrl_sym.representations import Representation
-from torchrl_sym.specs import check_box, check_normalizers, check_size
+from torchrl_sym.specs import check_part, counter_names
+from torchrl_sym.trial import Declared
 
 Elements = Literal["all", "random"] | Sequence[str]
-
-# Entries that TorchRL's environments, collectors, value estimators and buffers add to a batch and that
-# a symmetric copy shares with its original (Eq. sym-aug keeps log-probability, advantage and return).
-_INVARIANT = frozenset(
-    [
-        *("reward", "done", "terminated", "truncated", "is_init", "step_count", "episode_reward"),
-        *("advantage", "value_target", "state_value", "value_error", "returns", "td_error"),
-        *("index", "index_generation", "priority_weight", "mask", "shifted_valid", "traj_ids"),
-        *("sample_log_prob", "symmetry_id", "original_reward", "steps_to_next_obs", "gamma", "nonterminal"),
-        *("traj_count", "target_return", "time_step", "time_reset", "time_policy"),
-    ]
-)
 
 
 class Symmetry(nn.Module):
@@ -42,17 +35,20 @@ class Symmetry(nn.Module):
 
     Args:
         group: the group, shared by all representations.
-        representations: how each entry's last dimension transforms, by (nested) key. ``("next", key)``
-            follows ``key``. If an action is declared, the ``loc`` and ``scale`` that a probabilistic
-            actor writes beside it follow it too (``scale`` without signs).
-        strict: raise on entries that are neither declared nor of a kind that symmetric copies share
-            (reward, done, log-probability, advantage, ... and anything under ``"collector"`` or
-            starting with ``_``). With ``False`` they are copied unchanged.
+        representations: how each entry transforms, by (nested) key. ``("next", key)`` follows ``key``.
+            Entries of several keys that change places are declared together, by :class:`Exchanged`. What
+            an actor writes beside an action follows the action: ``loc``, and without signs ``scale``,
+            ``logits``, ``probs``, ``action_value``.
+        strict: raise on entries that are neither declared nor of a kind that symmetric copies share:
+            reward, done, log-probability, advantage, ... with one number per row (with one per entry of
+            the action, or per agent, they change places as it does), and TorchRL's bookkeeping, such as
+            anything under ``"collector"``. With ``False`` all others are copied unchanged.
 
     Raises:
         TypeError: a value is not a representation, or a key is none.
-        ValueError: a representation belongs to another group, a key is that of a ``"next"`` entry, or two
-            keys are spellings of one.
+        ValueError: a representation belongs to another group; a key is that of a ``"next"`` entry; two keys
+            are spellings of one, or one is declared twice; or two keys are named after sides, such as left
+            and right, that an element exchanges, but are not declared together.
 
     Example:
         >>> import torch
@@ -72,7 +68,7 @@ class Symmetry(nn.Module):
     def __init__(
         self,
         group: PointGroup,
-        representations: Mapping[NestedKey, Representation],
+        representations: Mapping[NestedKey | Exchanged, Representation],
         *,
         strict: bool = True,
     ) -> None:
@@ -80,68 +76,67 @@ class Symmetry(nn.Module):
         check_group(group)
         if not checks.mapping("representations", representations, "keys to representations"):
             raise ValueError("expected at least one key with its representation, got none")
-        for key, value in representations.items():
-            if not isinstance(value, Representation):
-                raise TypeError(
-                    f"expected a Representation for {key!r}, got {type(value).__name__}; build one with "
-                    "torchrl_sym.representations, e.g. invariant(group, d)"
-                )
-            if value.group != group:
-                raise ValueError(
-                    f"the representation of {key!r} belongs to {value.group}, expected {group}; build "
-                    "it for this group or use representation.restrict(group)"
-                )
         self.group = group
         self.strict = checks.flag("strict", strict)
-        self._keys = _distinct_keys(representations)
+        self._declaration = Declaration(group, representations)
         self.representations = nn.ModuleList(representations.values())
-        self._table: dict[NestedKey, Representation] = dict(
-            zip(self._keys, representations.values(), strict=True)
-        )
-        # what actors write beside an action; entries of batches only, never observations
-        self._written: dict[NestedKey, Representation | None] = {}
-        for key, action in self._table.items():
-            parent, leaf = _split(key)
-            if leaf == "action":
-                scale = action.absolute() if action.is_signed_permutation else None
-                if scale is not None:
-                    self.representations.append(scale)  # registered, so that it follows to(device)
-                self._written |= {_join(parent, "loc"): action, _join(parent, "scale"): scale}
 
     def keys(self) -> list[NestedKey]:
         """The declared keys."""
-        return list(self._keys)
+        return self._declaration.keys
+
+    def together(self, keys: Iterable[NestedKey]) -> list[NestedKey]:
+        """Keys, and those that they change places with."""
+        found: dict[NestedKey, None] = {}
+        for key in keys:
+            part = self._declaration.part(key)
+            found |= dict.fromkeys([key] if part is None or len(part[0]) == 1 else part[0])
+        return list(found)
 
     def __contains__(self, key: NestedKey) -> bool:
-        return _without_next(unravel_key(key)) in self._table
+        return self._declaration.part(key) is not None
 
     def __getitem__(self, key: NestedKey) -> Representation:
         """Representation of a key.
 
         Raises:
-            KeyError: the key is not declared; the message lists those that are.
+            KeyError: the key is not declared, or only together with others.
         """
-        if checks.key("key", key) not in self:
+        part = self._declaration.part(checks.key("key", key))
+        if part is None:
             raise KeyError(
-                f"no representation for {key!r}; this symmetry has {self._keys}. Add it to the "
+                f"no representation for {key!r}; this symmetry has {self.keys()}. Add it to the "
                 "dictionary passed to Symmetry, e.g. invariant(group, d) if no element changes it"
             )
-        return self._table[_without_next(unravel_key(key))]
+        names, representation = part
+        if len(names) > 1:
+            raise KeyError(f"{key!r} has no representation of its own: {names} change places")
+        return representation
+
+    def event_dims(self, key: NestedKey) -> int:
+        """Number of dimensions behind those of the batch, of a declared entry; 1 for any other."""
+        part = self._declaration.part(key)
+        if part is None:
+            return 1
+        names, representation = part
+        dims = len(representation.event_shape)
+        return dims - 1 if len(names) > 1 and dims > 1 else dims
 
     def require(self, keys: Iterable[NestedKey], reader: str) -> None:
-        """Raise KeyError unless every key is declared, or of a kind that copies share."""
+        """Raise KeyError unless every key that a network reads is declared, whatever its name.
+
+        Only ``is_init``, which says where a recurrent network begins anew, is the same for all copies.
+        """
+        known = {*self.keys(), *(group for key in self.keys() for group in enclosing(key))}
         keys = [checks.key("keys", key) for key in checks.sequence("keys", keys)]
-        missing = [key for key in keys if key not in self and not _is_shared(key)]
-        if any("recurrent_state" in _split(key)[1] for key in missing):
-            raise KeyError(
-                f"{reader} reads the memory {missing}: the memory after a mirrored history is not a linear "
-                "image of the stored one; start copies from a zero memory (declare it invariant and sample "
-                "slices that begin where is_init is set), or use a policy without memory"
-            )
+        bare = {key: without_next(key) for key in keys}
+        missing = [key for key in keys if bare[key] not in known and split(bare[key])[1] != "is_init"]
         if missing:
+            reserved = [key for key in missing if split(key)[1] in _INVARIANT]
+            hint = f" (copies share TorchRL's {reserved}, but not with a network that reads them)"
             raise KeyError(
-                f"{reader} reads {missing}, which this symmetry does not transform (it has "
-                f"{self._keys}); add them, e.g. invariant(group, d) if no element changes them"
+                f"{reader} reads {missing}, which this symmetry does not transform (it has {self.keys()}); "
+                f"add them, e.g. invariant(group, d) if no element changes them{hint if reserved else ''}"
             )
 
     def elements(self, elements: Elements) -> list[int]:
@@ -179,23 +174,64 @@ class Symmetry(nn.Module):
         g: int | str | Tensor,
         *,
         keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
     ) -> TensorDictBase:
         """Symmetric copy of a tensordict under one element, or one element per row.
 
         Args:
             tensordict: any batch; it is not modified.
             g: element index or name, or indices of shape ``tensordict.batch_size``.
-            keys: what to map; every other entry is shared. Defaults to all that is declared.
+            keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
+            followers: entries that hold one number per row, per component of an action or per agent, with
+                the key of that action: for names that do not tell, as ``action_log_prob`` does.
 
         Raises:
-            KeyError: an entry that the symmetry should know but does not (strict, or named by ``keys``).
-            ValueError: a tensor's last dimension differs from its representation's.
+            KeyError: entries that the symmetry should know but does not (strict, or named by ``keys``).
+            ValueError: a tensor's event dimensions, behind those of the batch, differ from its
+                representation's.
             TypeError: no tensordict.
         """
+        if isinstance(g, Tensor) and g.ndim:
+            return self.per_row(
+                tensordict, self._checked_rows(tensordict, g), keys=keys, followers=followers
+            )
         out = check_batch(tensordict).copy()
-        for key, representation, value in self._mapped(tensordict, keys):
-            out.set(key, representation(value, g))
+        for key, image in self._images(tensordict, keys, followers, lambda rho, x: rho(x, g)):
+            out.set(key, image)
         return out
+
+    def per_row(
+        self,
+        tensordict: TensorDictBase,
+        element: Tensor,
+        *,
+        keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
+    ) -> TensorDictBase:
+        """Copy of each row under its own element, of which nobody asks whether it exists.
+
+        For indices that :meth:`draw` made: to look at them would make the host wait for an accelerator.
+        """
+        out = check_batch(tensordict).copy()
+        for key, image in self._images(tensordict, keys, followers, lambda rho, x: rho.per_row(x, element)):
+            out.set(key, image)
+        return out
+
+    def _checked_rows(self, tensordict: TensorDictBase, element: Tensor) -> Tensor:
+        if element.is_floating_point() or element.dtype == torch.bool:
+            raise ValueError(f"expected indices of elements, got {element.dtype}")
+        if element.shape != check_batch(tensordict).batch_size[: element.ndim]:
+            raise ValueError(
+                f"expected an element for each row of {tuple(tensordict.batch_size)}, got indices of shape "
+                f"{tuple(element.shape)}"
+            )
+        if element.device.type == "cpu" and not torch.compiler.is_compiling() and element.numel():
+            low, high = element.aminmax()  # on an accelerator, the host would have to wait for these
+            if low < 0 or high >= self.group.order:
+                raise KeyError(
+                    f"expected element indices in [0, {self.group.order}), got {int(low)} to {int(high)}"
+                )
+        return element
 
     def orbit(
         self,
@@ -203,6 +239,7 @@ class Symmetry(nn.Module):
         elements: Sequence[int] | None = None,
         *,
         keys: Iterable[NestedKey] | None = None,
+        followers: Mapping[NestedKey, NestedKey] | None = None,
     ) -> TensorDictBase:
         """All symmetric copies: batch ``[*B]`` to ``[N, *B]``, the originals first.
 
@@ -211,61 +248,50 @@ class Symmetry(nn.Module):
         Args:
             tensordict: any batch; it is not modified.
             elements: indices of the elements to apply. Defaults to all of the group.
-            keys: what to map; every other entry is shared. Defaults to all that is declared.
+            keys: what to map; every other entry is shared. Defaults to all that is declared or follows it.
+            followers: entries that hold one number per row, per component of an action or per agent, with
+                the key of that action: for names that do not tell, as ``action_log_prob`` does.
         """
         if elements is not None:
             elements = checks.sequence("elements", elements, of="indices")
         count = self.group.order if elements is None else len(elements)
         if count == 0:
             raise ValueError("elements: expected at least one element, got none")
+
+        def act(rho: Representation, x: Tensor) -> Tensor:
+            return rho.orbit(x) if elements is None else torch.stack([rho(x, g) for g in elements])
+
         out = check_batch(tensordict).expand(count, *tensordict.batch_size).copy()
-        for key, representation, value in self._mapped(tensordict, keys):
-            if elements is None:
-                images = representation.orbit(value)
-            else:
-                images = torch.stack([representation(value, g) for g in elements])
-            out.set(key, images)
+        for key, image in self._images(tensordict, keys, followers, act):
+            out.set(key, image)
         return out
 
-    def _mapped(self, tensordict: TensorDictBase, keys: Iterable[NestedKey] | None):
-        strict = self.strict or keys is not None  # what is asked for by name must be known
+    def _images(
+        self,
+        tensordict: TensorDictBase,
+        keys: Iterable[NestedKey] | None,
+        followers: Mapping[NestedKey, NestedKey] | None,
+        act: Callable[[Representation, Tensor], Tensor],
+    ) -> Iterator[tuple[NestedKey, Tensor]]:
+        """Every entry that differs between copies, with what ``act`` makes of it."""
         if keys is None:
-            chosen = tensordict.keys(include_nested=True, leaves_only=True)
+            require_even(tensordict)
+            chosen = tensordict.keys(True, True, is_leaf=is_leaf_nontensor)
         else:
             chosen = [checks.key("keys", key) for key in checks.sequence("keys", keys, of="keys")]
-        for key in chosen:
-            representation = self._resolve(key, strict)
-            if representation is not None:
-                value = tensordict.get(key, None)
-                if isinstance(value, Tensor):
-                    if value.ndim <= tensordict.batch_dims or value.shape[-1] != representation.dim:
-                        raise ValueError(
-                            f"entry {key!r}: expected a last dimension of {representation.dim}, got "
-                            f"shape {tuple(value.shape)} with batch size "
-                            f"{tuple(tensordict.batch_size)}; list every entry of the tensor in order"
-                        )
-                    yield key, representation, value
-
-    def _resolve(self, key: NestedKey, strict: bool) -> Representation | None:
-        """Representation of a batch entry, None if copies share it, KeyError if it is unknown."""
-        bare = _without_next(unravel_key(key))
-        if bare in self._table:
-            return self._table[bare]
-        if bare in self._written:
-            if self._written[bare] is None:
-                raise KeyError(
-                    f"the batch has {key!r}, but the action's representation mixes entries, which carries "
-                    "no diagonal scale to another; drop it with select=..., or declare it with "
-                    "invariant(group, d) if all its entries are equal"
-                )
-            return self._written[bare]
-        if strict and not _is_shared(bare):
-            raise KeyError(
-                f"the batch has {key!r}, which this symmetry does not know (it has {self._keys}); add "
-                "its representation, e.g. invariant(group, d) if no element changes it, drop it with "
-                "select=..., or pass strict=False to copy unknown entries unchanged"
-            )
-        return None
+        strict = self.strict or keys is not None  # what is asked for by name must be known
+        for names, representation in self._declaration.mapped(tensordict, chosen, strict, followers):
+            values = [tensordict.get(name) for name in names]
+            if len(names) == 1:
+                yield names[0], act(representation, values[0])
+                continue
+            dims = len(representation.event_shape)
+            if dims > 1:  # one item per key
+                images = act(representation, torch.stack(values, tensordict.batch_dims)).unbind(-dims)
+            else:
+                sizes = [value.shape[-1] for value in values]
+                images = act(representation, torch.cat(values, -1)).split(sizes, -1)
+            yield from zip(names, images, strict=True)
 
     def check_specs(self, env: EnvBase) -> None:
         """Check sizes and boxes of an environment's observations and actions.
@@ -276,27 +302,30 @@ class Symmetry(nn.Module):
         onto itself then, and nothing depends on it.
 
         Raises:
-            KeyError: an observation or action of the environment is not declared (strict).
-            ValueError: a size differs, a box is not symmetric, or a running normaliser, which L_g does
-                not commute with, is applied to a declared observation.
+            KeyError: observations or actions of the environment are not declared (strict), but for those
+                that TorchRL's counters (StepCounter, RewardSum, InitTracker) write.
+            ValueError: a size differs, a box is not symmetric, or a transform, such as a normaliser, does
+                not commute with L_g or K_g.
         """
         checks.instance("env", env, EnvBase)
-        check_normalizers(env, self._keys)
+        counters = counter_names(env)
+        unknown: list[NestedKey] = []
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
-            for key, spec in specs.items(include_nested=True, leaves_only=True):
-                if key in self:
-                    check_size(key, spec, self[key])
-                    if is_action or self[key].is_signed_permutation:
-                        check_box(key, spec, self[key])
-                elif self.strict and not _is_shared(key):
-                    raise KeyError(
-                        f"the environment has {key!r}, which this symmetry does not know (it has "
-                        f"{self._keys}); add its representation, e.g. invariant(group, d) if no element "
-                        "changes it"
-                    )
+            leaves: dict[NestedKey, TensorSpec] = dict(specs.items(True, True))  # pyright: ignore[reportAssignmentType]
+            unknown += [key for key in leaves if key not in self and split(key)[1] not in counters]
+            for names, representation in self._declaration.parts:
+                if any(name in leaves for name in names):
+                    found = {name: leaves[name] for name in names if name in leaves}
+                    check_part(names, found, env.batch_size, representation, bounded=is_action)
+        if unknown and self.strict:
+            raise KeyError(
+                f"the environment has {unknown}, which this symmetry does not know (it has {self.keys()}); "
+                "add their representations, e.g. invariant(group, d) for what no element changes"
+            )
+        check_transforms(env, Declared(self.keys(), self, self.group.names))
 
     def extra_repr(self) -> str:
-        return f"{self.group!r}, keys={self._keys}"
+        return f"{self.group!r}, keys={self.keys()}"
 
 
 def check_batch(tensordict: TensorDictBase) -> TensorDictBase:
@@ -309,48 +338,3 @@ def check_batch(tensordict: TensorDictBase) -> TensorDictBase:
 def check_symmetry(symmetry: Symmetry) -> Symmetry:
     """TypeError unless it is a symmetry."""
     return checks.instance("symmetry", symmetry, Symmetry, "build Symmetry(group, {key: representation})")
-
-
-def _distinct_keys(keys: Iterable[NestedKey]) -> list[NestedKey]:
-    """The keys of a symmetry in their shortest spelling."""
-    found: dict[NestedKey, NestedKey] = {}
-    for spelling in keys:
-        key = checks.key("representations", spelling)
-        bare = _without_next(key)
-        if bare != key or key == "next":
-            raise ValueError(
-                f"expected keys without 'next', got {spelling!r}; declare the entry itself, whose "
-                "representation the one under 'next' follows"
-            )
-        if key in found:
-            raise ValueError(
-                f"expected distinct keys, got {found[key]!r} and {spelling!r}; declare one of them"
-            )
-        found[key] = spelling
-    return list(found)
-
-
-def _is_shared(key: NestedKey) -> bool:
-    """Whether symmetric copies share an entry with their original, judging by its key."""
-    parent, leaf = _split(_without_next(unravel_key(key)))
-    return (
-        leaf in _INVARIANT
-        or leaf.endswith("log_prob")
-        or leaf.startswith("_")
-        or (len(parent) > 0 and parent[0] == "collector")
-    )
-
-
-def _without_next(key: NestedKey) -> NestedKey:
-    if isinstance(key, tuple) and key[0] == "next":
-        return unravel_key(key[1:])
-    return key
-
-
-def _split(key: NestedKey) -> tuple[tuple[str, ...], str]:
-    parts = (key,) if isinstance(key, str) else tuple(map(str, key))
-    return parts[:-1], parts[-1]
-
-
-def _join(parent: tuple[str, ...], leaf: str) -> NestedKey:
-    return unravel_key((*parent, leaf))

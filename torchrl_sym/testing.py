@@ -37,15 +37,22 @@ def assert_representation(representation: Representation, *, tolerance: float = 
     """
     checks.instance("representation", representation, Representation)
     tolerance = checks.real("tolerance", tolerance, 0.0)
-    group, matrices = representation.group, representation.matrices
-    eye = torch.eye(representation.dim, dtype=matrices.dtype)
-    residual = (matrices[0] - eye).abs().amax() if representation.dim else torch.zeros(())
+    group = representation.group
+    generator = torch.Generator("cpu").manual_seed(0)
+    shape = (
+        4,
+        *representation.event_shape,
+    )  # a linear map that errs does so on numbers in general position
+    x = torch.randn(shape, generator=generator, dtype=torch.float64, device="cpu")
+    images = representation.orbit(x)
+    residual = (images[0] - x).abs().max()
     assert residual <= tolerance, f"the identity acts as something else, off by {residual:.2g}"
+    length = x.flatten(1).norm(dim=-1)
     for g, name in enumerate(group.names):
-        residual = (matrices[g] @ matrices[g].mT - eye).abs().max()
+        residual = (images[g].flatten(1).norm(dim=-1) / length - 1).abs().max()
         assert residual <= tolerance, f"{name!r} does not act orthogonally, off by {residual:.2g}"
         for h, other in enumerate(group.names):
-            residual = (matrices[g] @ matrices[h] - matrices[int(group.table[g, h])]).abs().max()
+            residual = (representation(images[h], g) - images[int(group.table[g, h])]).abs().max()
             assert residual <= tolerance, (
                 f"rho({name}) rho({other}) differs from rho({group.names[int(group.table[g, h])]}) by "
                 f"{residual:.2g}"

@@ -24,7 +24,6 @@ from torch import Tensor
 from torchrl_sym import checks
 from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
 from torchrl_sym.mujoco.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
-from torchrl_sym.specs import image_of_box
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 
 # In the order of cause: a wrong part makes those after it wrong as well. States come before observations,
@@ -318,7 +317,7 @@ class _Check:
 
     def action_box(self) -> None:
         box = self.subject.low, self.subject.high
-        images = image_of_box(self.subject.symmetry["action"].matrices.cpu(), *box)
+        images = self.subject.symmetry["action"].image_of_box(*box)
         for g, element in enumerate(self.group.names):
             pairs = zip(images, box, strict=True)
             gap = np.maximum(*(torch.where(a[g] == b, 0.0, (a[g] - b).abs()).numpy() for a, b in pairs))

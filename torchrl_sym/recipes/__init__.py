@@ -1,6 +1,7 @@
 """Training recipes: PPO with symmetry as one linear loop."""
 
 from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.export import export_policy
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_actor, make_critic
 from torchrl_sym.recipes.runs import export_actor, load_actor
@@ -16,6 +17,7 @@ __all__ = [
     "Stage",
     "Training",
     "export_actor",
+    "export_policy",
     "load_actor",
     "make_actor",
     "make_critic",

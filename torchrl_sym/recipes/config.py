@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
+from tensordict import NestedKey
 
-from torchrl_sym.checks import flag, one_of, real, sequence, whole
+from torchrl_sym.checks import flag, key, one_of, real, sequence, whole
 
 
 @dataclass(frozen=True)
@@ -92,12 +93,28 @@ class PPOConfig:
     """Factor on the network's output: the size, in units of the action, of an ordinary action. Legged
     robots have a wide action box and work in a quarter of it."""
 
+    normalize_observations: bool = False
+    """Put a running normaliser that commutes with the group inside actor and critic, updated after every
+    iteration. Off, since the tasks' observations are scaled by constants."""
+    normalize_rewards: bool = False
+    """Divide rewards by the standard deviation of the running discounted return."""
+    actor_keys: tuple[NestedKey, ...] | None = None
+    """Observations that the actor reads; the rest is for the critic, which is not there when a robot acts.
+    None: all that the symmetry declares."""
+    critic_keys: tuple[NestedKey, ...] | None = None
+    """Observations that the critic reads. None: all that the symmetry declares."""
+
     max_log_ratio: float = 20.0
     """Bound of log pi / pi_k for naive augmentation, which overflows without; inf for none."""
     checkpoint_interval: int = 1
     """Iterations between checkpoints; the last one is always saved."""
     device: str = "cpu"
     """Where networks and updates live; physics stays on the CPU."""
+    compile: bool = False
+    """Compile the losses, where there is a compiler: about a minute before the first update."""
+    autocast: Literal["bfloat16"] | None = None
+    """Precision of the matrix products in the losses, None for that of the networks. Advantages, actions
+    and the parameters keep theirs."""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -140,11 +157,11 @@ class PPOConfig:
     def differences(self, stored: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
         """Fields that differ from a stored configuration, as ``{name: (stored, mine)}``.
 
-        Iterations, checkpoint interval and device may change when a run is continued; iterations only if
-        no schedule depends on them. A field that was added after the configuration was stored counts as
-        having had its default.
+        Iterations, checkpoint interval, device and compilation may change when a run is continued;
+        iterations only if no schedule depends on them. A field that was added after the configuration was
+        stored counts as having had its default.
         """
-        free = {"checkpoint_interval", "device"}
+        free = {"checkpoint_interval", "device", "compile"}
         if self.std_schedule is None or self.std_schedule[0] == self.std_schedule[1]:
             free.add("iterations")
         other = dataclasses.asdict(PPOConfig(**stored))
@@ -158,6 +175,7 @@ class PPOConfig:
 _CHOICES = {
     "augmentation": ("none", "all", "random", "naive"),
     "adapt_every": ("minibatch", "iteration"),
+    "autocast": ("bfloat16",),
 }
 _RANGES: dict[str, dict[str, float]] = {
     "gamma": {"low": 0, "high": 1},
@@ -179,14 +197,16 @@ def _checked(name: str, kind: str, value: Any) -> Any:
         TypeError: not of the field's type.
         ValueError: out of its range.
     """
+    if value is None and kind.endswith("None"):
+        return None
     if name in _CHOICES:
         return one_of(name, value, _CHOICES[name])
     if name == "device":
         return _device(value)
     if kind == "bool":
         return flag(name, value)
-    if value is None and kind.endswith("None"):
-        return None
+    if kind.startswith("tuple[NestedKey"):
+        return _keys(name, value)
     if kind.startswith("tuple[int"):
         return tuple(whole(name, size, low=1) for size in sequence(name, value, "sizes"))
     if kind.startswith("tuple[float"):
@@ -199,6 +219,18 @@ def _checked(name: str, kind: str, value: Any) -> Any:
     if name in _MAY_BE_INFINITE and isinstance(value, float) and value == math.inf:
         return math.inf
     return real(name, value, **_RANGES.get(name, {"above": 0}))
+
+
+def _keys(name: str, value: Any) -> tuple[NestedKey, ...]:
+    """Keys, of which nested ones may be lists, as in a file of JSON."""
+    keys = [
+        key(name, tuple(each) if isinstance(each, list) else each) for each in sequence(name, value, "keys")
+    ]
+    if not keys:
+        raise ValueError(f"{name}: expected at least one key, got none; None for all")
+    if len(set(keys)) != len(keys):
+        raise ValueError(f"{name}: expected distinct keys, got {value!r}")
+    return tuple(keys)
 
 
 def _device(value: Any) -> str:

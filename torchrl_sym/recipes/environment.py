@@ -10,7 +10,9 @@ from __future__ import annotations
 import numbers
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
+
+from torchrl_sym.environments import bare
 
 
 class MakeEnv(Protocol):
@@ -68,13 +70,6 @@ def offered(env: EnvBase, offer: type[Offer]) -> Offer | None:
     """The environment inside all transforms, if its class has an offer."""
     base = bare(env)
     return base if issubclass(type(base), offer) else None  # pyright: ignore[reportReturnType]
-
-
-def bare(env: EnvBase) -> EnvBase:
-    """The environment inside all transforms."""
-    while isinstance(env, TransformedEnv):
-        env = env.base_env
-    return env
 
 
 def measure(env: EnvBase) -> dict[str, float]:

@@ -6,31 +6,29 @@ be V(L_g s) and its advantage not the A_k(s, a) of Eq. (sym-aug).
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import nullcontext
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer, SamplerWithoutReplacement
-from torchrl.modules import ValueOperator
-from torchrl.objectives import ClipPPOLoss, KLAdaptiveLR, LossModule
+from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
+from torchrl_sym.augment import SymmetryAugment
 from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.recipes.compilation import compiled
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.networks import gaussian
+from torchrl_sym.recipes.rate import AdaptiveRate
 from torchrl_sym.symmetric_ppo import SymmetricClipPPOLoss
 from torchrl_sym.symmetry import Symmetry
-from torchrl_sym.transforms import SymmetryAugment
 
 
 class Learner:
-    """Losses, buffer, optimizer and learning rate of the recipe.
+    """Losses, optimizer and learning rate of the recipe.
 
     Args:
         config: hyper-parameters.
@@ -43,7 +41,7 @@ class Learner:
         self,
         config: PPOConfig,
         actor: ProbabilisticTensorDictSequential,
-        critic: ValueOperator,
+        critic: TensorDictModuleBase,
         symmetry: Symmetry,
     ) -> None:
         self.config, self.actor, self.critic = config, actor, critic
@@ -51,20 +49,14 @@ class Learner:
         self.parameters = [*actor.parameters(), *critic.parameters()]
         self.optimizer = torch.optim.Adam(self.parameters, lr=config.learning_rate, fused=True)
         self.losses = make_losses(config, actor, critic, symmetry)
-        self.gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=critic, average_gae=True)
+        self.gae = GAE(gamma=config.gamma, lmbda=config.lmbda, value_network=None, average_gae=True)
         naive = config.augmentation == "naive"
         self.naive = SymmetryAugment(symmetry, log_prob_from=actor) if naive else None
-
-        rows = config.num_envs * config.horizon * (symmetry.group.order if naive else 1)
-        self.buffer = ReplayBuffer(
-            storage=LazyTensorStorage(rows, device=config.device),
-            sampler=SamplerWithoutReplacement(),
-            batch_size=rows // config.minibatches,
-        )
+        self.evaluate = compiled(self._evaluate, config.device) if config.compile else self._evaluate
         self.schedule = None
         if config.desired_kl is not None:
-            bounds = {"min_lr": config.min_learning_rate, "max_lr": config.max_learning_rate}
-            self.schedule = KLAdaptiveLR(self.optimizer, config.desired_kl, **bounds)
+            bounds = {"low": config.min_learning_rate, "high": config.max_learning_rate}
+            self.schedule = AdaptiveRate(self.optimizer, config.desired_kl, **bounds)
 
     @property
     def parts(self) -> dict[str, Any]:
@@ -80,53 +72,117 @@ class Learner:
         Raises:
             FloatingPointError: a loss or its gradient is not finite; the parameters are those before it.
         """
+        return self.fit(self.estimate(data))
+
+    @torch.no_grad()
+    def estimate(self, data: TensorDictBase) -> TensorDictBase:
+        """The rows to learn from, with their advantages and value targets."""
         if self.naive is not None:
             data = self.naive(data)  # before GAE: also the advantage is that of the copies
-        with torch.no_grad():
-            self.gae(data)
-        self.buffer.empty()  # the sampler keeps a permutation drawn ahead, which no checkpoint would have
-        with _quiet():
-            self.buffer.extend(data.select(*self._keys()).reshape(-1))
+        estimate_values(self.critic, data)
+        self.gae(data)
+        return data.select(*self._keys()).reshape(-1)
 
+    def fit(self, rows: TensorDictBase) -> dict[str, float]:
+        """Some epochs of minibatch updates on rows of :meth:`estimate`; returns what :meth:`learn` does."""
+        size = len(rows) // self.config.minibatches
         reports: list[dict[str, Tensor]] = []
         for _ in range(self.config.epochs):
-            reports += [self._update(minibatch) for minibatch in self.buffer]
+            shuffled = rows[torch.randperm(len(rows), device=rows.device)]
+            reports += [self._update(minibatch) for minibatch in shuffled.split(size)]
         if self.schedule is not None and self.config.adapt_every == "iteration":
             last = reports[-self.config.minibatches :]
             self.schedule.step(torch.stack([report["kl"] for report in last]).mean())
-        means = {key: float(torch.stack([each[key] for each in reports]).mean()) for key in reports[0]}
-        return means | {"learning_rate": self.optimizer.param_groups[0]["lr"]}
+        return self._means(reports) | {"learning_rate": self._settled_rate()}
 
     def _update(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         """One step of the optimizer; returns the losses and diagnostics that are single numbers."""
-        out = {key: value for loss in self.losses for key, value in loss(minibatch).items()}
-        total = torch.stack([value for key, value in out.items() if key.startswith("loss_")]).sum()
-        self.optimizer.zero_grad()
+        out = self.evaluate(minibatch)
+        total = sum(value for key, value in out.items() if key.startswith("loss_"))
+        for parameter in self.parameters:  # the optimizer's zero_grad() takes ten times as long
+            parameter.grad = None
         total.backward()
         norm = nn.utils.clip_grad_norm_(self.parameters, self.config.max_grad_norm)
         # k3, the unbiased estimator of KL(pi_k | pi) that is never negative (Schulman, 2020)
         out["kl"] = out["mean_ratio"] - 1 + out["kl_approx"]
-        steering = 0.0 if self.schedule is None else out["kl"]  # one that is only reported may be inf
-        if not (norm + total + steering).isfinite():
-            numbers = {key: v.item() for key, v in out.items() if key.startswith("loss_") or key == "kl"}
-            raise FloatingPointError(
-                f"expected finite losses and gradients, got {numbers} and a gradient of norm "
-                f"{norm.item()}; lower learning_rate or max_learning_rate, or bound the std"
-            )
+        report = {key: value.detach().squeeze() for key, value in out.items() if value.numel() == 1}
+        report["gradient_norm"] = norm
+        if norm.device.type == "cpu":  # elsewhere the host would wait: they are looked at in the end
+            self._require_finite({key: value.item() for key, value in self._vital(report).items()})
 
         if self.schedule is not None and self.config.adapt_every == "minibatch":
             self.schedule.step(out["kl"])  # for this very step, as rsl_rl does: not one step late
         self.optimizer.step()
         self.policy.keep_in_bounds()
-        return {key: value.detach().squeeze() for key, value in out.items() if value.numel() == 1}
+        return report
+
+    def _evaluate(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
+        """All losses of a minibatch and their diagnostics."""
+        with self._precision():
+            return {key: value for loss in self.losses for key, value in loss(minibatch).items()}
+
+    def _precision(self) -> torch.autocast | nullcontext:
+        if self.config.autocast is None:
+            return nullcontext()
+        kind = torch.device(self.config.device).type
+        return torch.autocast(kind, dtype=getattr(torch, self.config.autocast))
+
+    def _means(self, reports: list[dict[str, Tensor]]) -> dict[str, float]:
+        """Means over the updates, fetched at once."""
+        names = list(reports[0])
+        table = torch.stack([torch.stack([report[name] for name in names]) for report in reports])
+        *rows, means = torch.cat([table, table.mean(0, keepdim=True)]).tolist()
+        for row in rows:
+            self._require_finite(self._vital(dict(zip(names, row, strict=True))))
+        return dict(zip(names, means, strict=True))
+
+    def _vital(self, report: dict[str, Any]) -> dict[str, Any]:
+        """What must be finite; a KL that steers nothing may be infinite."""
+        steering = {"kl"} if self.schedule is not None else set()
+        return {
+            key: value
+            for key, value in report.items()
+            if key.startswith("loss_") or key in {"gradient_norm", *steering}
+        }
+
+    def _require_finite(self, numbers: dict[str, float]) -> None:
+        if not all(map(math.isfinite, numbers.values())):
+            raise FloatingPointError(
+                f"expected finite losses and gradients, got {numbers}; lower learning_rate or "
+                "max_learning_rate, or bound the std"
+            )
+
+    def _settled_rate(self) -> float:
+        """The learning rate as the number that a checkpoint holds."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = float(group["lr"])
+        return self.optimizer.param_groups[0]["lr"]
 
     def _keys(self) -> list:
         own = ["action", *self.actor.log_prob_keys, "advantage", "value_target", "state_value"]
         return list(dict.fromkeys([*self.actor.in_keys, *self.critic.in_keys, *own]))
 
 
+def estimate_values(critic: TensorDictModuleBase, data: TensorDictBase) -> None:
+    """Write V of every state and next state of a batch ``[*env, T]``, in one pass of the critic.
+
+    A next state is the state of the row after it, except where an episode ends and in the last row.
+    """
+    keys = critic.in_keys
+    data["state_value"] = critic(data.select(*keys))["state_value"]
+    nexts = data["next"]
+    apart = nexts["done"].squeeze(-1).clone()
+    apart[..., -1] = True
+    value = torch.cat([data["state_value"][..., 1:, :], data["state_value"][..., :1, :]], dim=-2)
+    value[apart] = critic(nexts.select(*keys)[apart])["state_value"]
+    nexts["state_value"] = value
+
+
 def make_losses(
-    config: PPOConfig, actor: ProbabilisticTensorDictSequential, critic: ValueOperator, symmetry: Symmetry
+    config: PPOConfig,
+    actor: ProbabilisticTensorDictSequential,
+    critic: TensorDictModuleBase,
+    symmetry: Symmetry,
 ) -> list[LossModule]:
     """The losses to add up: PPO with or without copies, and a mirror loss where none is built in."""
     kwargs: dict[str, Any] = {
@@ -146,15 +202,3 @@ def make_losses(
     if config.mirror_coeff > 0:
         losses.append(MirrorLoss(actor, symmetry=symmetry, coeff=config.mirror_coeff, functional=False))
     return losses
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without TorchRL's messages, the first of which would cut a progress bar in two."""
-    logger = logging.getLogger("torchrl")
-    level = logger.level
-    logger.setLevel(max(level, logging.WARNING))
-    try:
-        yield
-    finally:
-        logger.setLevel(level)

@@ -10,7 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import EnvBase
 
-from torchrl_sym.mirror_loss import deterministic_action, squared_distance
+from torchrl_sym.mirror_loss import mirror_error
+from torchrl_sym.outputs import deterministic_action
 from torchrl_sym.symmetry import Symmetry
 
 _MAX_ROWS = 2048  # rows on which the symmetry metrics are evaluated
@@ -80,9 +81,6 @@ def symmetry_metrics(
     log_prob = dist.log_prob(orbit["action"])  # (N, rows)
     copies = log_prob[1:] if len(log_prob) > 1 else log_prob
     action = deterministic_action(dist)  # pi(L_g[s])
-    error = squared_distance(action, symmetry["action"].orbit(action[0]))
-    return {
-        "mirror_loss": float(error.sum(0).mean()),
-        "log_prob": float(log_prob[0].mean()),
-        "log_prob_copies": float(copies.mean()),
-    }
+    error = mirror_error(action, action[0], symmetry["action"], range(len(action)))
+    means = torch.stack([error.sum(0).mean(), log_prob[0].mean(), copies.mean()])
+    return dict(zip(("mirror_loss", "log_prob", "log_prob_copies"), means.tolist(), strict=True))

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import NestedKey
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
 
+from torchrl_sym.normalization import SymmetricNorm
 from torchrl_sym.recipes.config import PPOConfig
+from torchrl_sym.recipes.keyed import KeyedModule
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry
 
@@ -25,11 +28,22 @@ class FeedForward(nn.Module):
         out_size: number of outputs.
         hidden: sizes of the hidden layers.
         scale: factor on the outputs.
+        norm: normalises the inputs first.
+        event_dims: number of event dimensions of each input. Defaults to one each.
     """
 
-    def __init__(self, in_size: int, out_size: int, hidden: Sequence[int], scale: float = 1.0) -> None:
+    def __init__(
+        self,
+        in_size: int,
+        out_size: int,
+        hidden: Sequence[int],
+        scale: float = 1.0,
+        *,
+        norm: SymmetricNorm | None = None,
+        event_dims: Sequence[int] | None = None,
+    ) -> None:
         super().__init__()
-        self.scale = scale
+        self.scale, self.norm, self.event_dims = scale, norm, event_dims
         self.net = MLP(in_size, out_size, num_cells=list(hidden), activation_class=nn.ELU)
 
     @property
@@ -38,6 +52,11 @@ class FeedForward(nn.Module):
         return [layer for layer in self.net if isinstance(layer, nn.Linear)]
 
     def forward(self, *inputs: Tensor) -> Tensor:
+        if self.norm is not None:
+            normal = self.norm(*inputs)
+            inputs = normal if isinstance(normal, tuple) else (normal,)
+        if self.event_dims is not None:
+            inputs = tuple(x.flatten(-d) for x, d in zip(inputs, self.event_dims, strict=True))
         x = inputs[0] if len(inputs) == 1 else torch.cat(inputs, dim=-1)
         out = self.net(x.to(next(self.net.parameters()).dtype))
         return out if self.scale == 1.0 else out * self.scale
@@ -106,6 +125,9 @@ def make_actor(
     in_size: int,
     out_size: int,
     action: Representation | None = None,
+    *,
+    norm: SymmetricNorm | None = None,
+    event_dims: Sequence[int] | None = None,
 ) -> ProbabilisticTensorDictSequential:
     """Gaussian policy on the concatenated inputs; actions are clipped by the environment, if at all.
 
@@ -115,8 +137,16 @@ def make_actor(
         in_size: number of entries it reads.
         out_size: number of actions.
         action: representation of the action, needed for ``config.tie_std``.
+        norm: of its inputs, needed for ``config.normalize_observations``.
+        event_dims: number of event dimensions of each input. Defaults to one each.
+
+    Raises:
+        ValueError: the configuration normalises observations, and there is no ``norm``.
     """
-    net = FeedForward(in_size, out_size, config.hidden, config.output_scale)
+    _require_norm(config, norm)
+    net = FeedForward(
+        in_size, out_size, config.hidden, config.output_scale, norm=norm, event_dims=event_dims
+    )
     with torch.no_grad():
         for layer in net.linear:
             scale = config.weight_scale * (config.last_layer_scale if layer is net.linear[-1] else 1.0)
@@ -125,25 +155,45 @@ def make_actor(
     bounds = (config.min_std, config.max_std)
     policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
     return ProbabilisticActor(
-        TensorDictModule(policy, in_keys=list(in_keys), out_keys=["loc", "scale"]),
+        KeyedModule(policy, in_keys, ["loc", "scale"]),
         in_keys=["loc", "scale"],
         distribution_class=IndependentNormal,
         return_log_prob=True,
     )
 
 
-def make_critic(config: PPOConfig, in_keys: Sequence[NestedKey], in_size: int) -> ValueOperator:
-    """State value on the concatenated inputs."""
-    return ValueOperator(FeedForward(in_size, 1, config.hidden), in_keys=list(in_keys))
+def make_critic(
+    config: PPOConfig,
+    in_keys: Sequence[NestedKey],
+    in_size: int,
+    *,
+    norm: SymmetricNorm | None = None,
+    event_dims: Sequence[int] | None = None,
+) -> KeyedModule:
+    """State value on the concatenated inputs; arguments as of :func:`make_actor`."""
+    _require_norm(config, norm)
+    net = FeedForward(in_size, 1, config.hidden, norm=norm, event_dims=event_dims)
+    return KeyedModule(net, in_keys, ["state_value"])
+
+
+def _require_norm(config: PPOConfig, norm: SymmetricNorm | None) -> None:
+    if config.normalize_observations and norm is None:
+        raise ValueError(
+            "norm: expected a normaliser, since config.normalize_observations is set, got None; pass "
+            "SymmetricNorm(*representations of the inputs)"
+        )
 
 
 def make_networks(
     config: PPOConfig, env: EnvBase, symmetry: Symmetry
-) -> tuple[ProbabilisticTensorDictSequential, ValueOperator]:
-    """Actor and critic that read every observation of the environment that the symmetry declares.
+) -> tuple[ProbabilisticTensorDictSequential, KeyedModule]:
+    """Actor and critic that read the observations of the environment that the symmetry declares.
+
+    Which of them actor and critic read, ``config.actor_keys`` and ``config.critic_keys`` say: what a robot
+    does not measure (friction, true velocities) may be for the critic only.
 
     Raises:
-        KeyError: the symmetry declares none of the observations.
+        KeyError: the symmetry declares none of the observations, or not one that is asked for.
         TypeError: the action is not one continuous ``"action"``.
     """
     spec = env.full_action_spec.get("action", None)
@@ -152,12 +202,34 @@ def make_networks(
             f"expected one continuous action under 'action', got {env.full_action_spec}; write a loop with "
             "SymmetricClipPPOLoss for other actions"
         )
-    keys = [key for key in symmetry.keys() if key in env.observation_spec.keys(True, True)]  # noqa: SIM118
-    if not keys:
+    observed = list(env.observation_spec.keys(True, True))
+    declared = [key for key in symmetry.keys() if key in observed]  # noqa: SIM118
+    if not declared:
         raise KeyError(
-            f"the environment observes {list(env.observation_spec.keys(True, True))}, none of which the "
-            f"symmetry declares ({symmetry.keys()}); add them"
+            f"the environment observes {observed}, none of which the symmetry declares "
+            f"({symmetry.keys()}); add them"
         )
-    size = sum(env.observation_spec[key].shape[-1] for key in keys)
-    actor = make_actor(config, keys, size, spec.shape[-1], symmetry["action"]).to(config.device)
-    return actor, make_critic(config, keys, size).to(config.device)
+    for name in ("actor_keys", "critic_keys"):
+        wrong = [key for key in getattr(config, name) or () if key not in declared]
+        if wrong:
+            raise KeyError(
+                f"{name}: expected observations that the symmetry declares, {declared}, got {wrong}; the "
+                f"environment observes {observed}"
+            )
+
+    actor_keys, critic_keys = (list(keys or declared) for keys in (config.actor_keys, config.critic_keys))
+    size, inputs = _inputs(config, env, symmetry, actor_keys)
+    actor = make_actor(config, actor_keys, size, spec.shape[-1], symmetry["action"], **inputs)
+    size, inputs = _inputs(config, env, symmetry, critic_keys)
+    critic = make_critic(config, critic_keys, size, **inputs)
+    return actor.to(config.device), critic.to(config.device)
+
+
+def _inputs(
+    config: PPOConfig, env: EnvBase, symmetry: Symmetry, keys: Sequence[NestedKey]
+) -> tuple[int, dict[str, Any]]:
+    """Number of entries under some keys, and what a network has to know about them."""
+    events = [env.observation_spec[key].shape[env.batch_dims :] for key in keys]
+    norm = SymmetricNorm(*(symmetry[key] for key in keys)) if config.normalize_observations else None
+    event_dims = None if all(len(event) == 1 for event in events) else [len(event) for event in events]
+    return sum(event.numel() for event in events), {"norm": norm, "event_dims": event_dims}

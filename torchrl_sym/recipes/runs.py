@@ -33,7 +33,8 @@ def load_actor(
         ValueError: the checkpoint is damaged, or its policy has other observations or actions.
     """
     path, checkpoint = _trained(folder)
-    config = dataclasses.replace(PPOConfig(**checkpoint["config"]), device="cpu")
+    # where a policy acts, there may be nothing of what only its critic has read
+    config = dataclasses.replace(PPOConfig(**checkpoint["config"]), device="cpu", critic_keys=None)
     actor, _ = make_networks(config, env, symmetry)
     try:
         actor.load_state_dict(checkpoint["parts"]["actor"])

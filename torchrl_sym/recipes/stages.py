@@ -105,7 +105,8 @@ def _check(stages: Sequence[Stage]) -> None:
     """What must not differ between stages, better said before the first than before the second."""
     if not stages or not all(isinstance(stage, Stage) for stage in stages):
         raise ValueError(f"expected a sequence of at least one Stage, got {stages!r}")
-    for name in ("num_envs", "hidden", "tie_std", "output_scale", "seed"):
+    inputs = ("normalize_observations", "normalize_rewards", "actor_keys", "critic_keys")
+    for name in ("num_envs", "hidden", "tie_std", "output_scale", "seed", *inputs):
         values = [getattr(stage.config, name) for stage in stages]
         if any(value != values[0] for value in values):
             raise ValueError(f"{name}: expected the same in all stages, got {values}")

@@ -9,10 +9,11 @@ import copy
 import os
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
@@ -29,6 +30,7 @@ from torchrl_sym.recipes.environment import MakeEnv, Staggered, measure, offered
 from torchrl_sym.recipes.learner import Learner
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
 from torchrl_sym.recipes.networks import make_networks
+from torchrl_sym.recipes.normalizers import RewardScale, observe
 from torchrl_sym.recipes.storage import RunFolder, make_logger, require_logger
 from torchrl_sym.symmetry import Symmetry
 
@@ -106,8 +108,8 @@ def train(
     Args:
         config: hyper-parameters.
         make_env: called with ``num_envs`` and ``seed``.
-        symmetry: what transforms how. Its observation keys are what actor and critic read. Also used,
-            as a metric, when nothing is augmented.
+        symmetry: what transforms how. Its observation keys are what actor and critic read, unless
+            ``config`` says which of them. Also used, as a metric, when nothing is augmented.
         folder: where metrics and checkpoints go; nothing is written by default. One process at a time can
             train in it.
         start_from: folder of another run, whose networks, optimizer (with its learning rate), running
@@ -178,6 +180,9 @@ class _Run:
             self.symmetry = copy.deepcopy(symmetry).to(config.device)
             actor, critic = make_networks(config, self.env, self.symmetry)
             self.learner = Learner(config, actor, critic, self.symmetry)
+            self.rewards = None
+            if config.normalize_rewards:
+                self.rewards = RewardScale(config.num_envs, config.gamma).to(config.device)
             self.episodes = Episodes(self.env)
             self.done, self.seconds = 0, 0.0
             if not self._continue():
@@ -186,6 +191,11 @@ class _Run:
         except BaseException:
             self.env.close()
             raise
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint holds of what has been learned, by name."""
+        return self.learner.parts | ({} if self.rewards is None else {"rewards": self.rewards})
 
     def _continue(self) -> bool:
         """Go on from the folder's checkpoint, if it has one that something has been learned for."""
@@ -200,7 +210,7 @@ class _Run:
             return False
         self.done, self.seconds = checkpoint["iteration"], checkpoint["seconds"]
         if self.done < self.config.iterations:
-            restore(self.folder, checkpoint, self.env, self.learner.parts, self.episodes)
+            restore(self.folder, checkpoint, self.env, self.parts, self.episodes)
             restore_random(checkpoint)
             warn_unless_exact(self.env)
         return True
@@ -208,7 +218,7 @@ class _Run:
     def _begin(self, start_from: RunFolder | None) -> None:
         """Begin, from another run or with episodes at all of their phases."""
         if start_from is not None:
-            earlier, parts = start_from.load(), self.learner.parts
+            earlier, parts = start_from.load(), self.parts
             found = [] if earlier is None else list(earlier["parts"])
             if earlier is None or set(parts) - set(found):
                 raise FileNotFoundError(
@@ -239,6 +249,7 @@ class _Run:
             policy_device=elsewhere,
             storing_device=elsewhere,
             auto_register_policy_transforms=False,
+            track_traj_ids=False,
         )
         log = make_logger(logger, None if self.folder is None else self.folder.path, name="train")
         bar = tqdm(total=config.iterations, initial=self.done, disable=not progress, unit="it")
@@ -249,12 +260,14 @@ class _Run:
                 self.done += 1
                 metrics: dict[str, float] = {"iteration": self.done, "frames": self.done * data.numel()}
                 metrics["collect_seconds"] = time.perf_counter() - began
-                _require_finite(data, learner.actor.in_keys)
+                _require_finite(data, {*learner.actor.in_keys, *learner.critic.in_keys})
 
                 metrics["return"] = episodes.update(data)
                 metrics |= measure(self.env)
                 metrics |= symmetry_metrics(learner.actor, self.symmetry, data)
-                metrics |= learner.learn(data)
+                metrics |= learner.learn(data if self.rewards is None else self.rewards(data))
+                for network in (learner.actor, learner.critic):
+                    observe(network, data)
                 metrics["std"] = float(data["scale"][..., 0, :].mean())
 
                 self.seconds = metrics["seconds"] = time.perf_counter() - clock
@@ -283,7 +296,7 @@ class _Run:
 
     def _save(self) -> None:
         assert self.folder is not None
-        state = (self.learner.parts, self.episodes, self.done, self.seconds)
+        state = (self.parts, self.episodes, self.done, self.seconds)
         self.folder.save(snapshot(self.config, self.env, *state))
 
     def close(self) -> None:
@@ -294,13 +307,14 @@ class _Run:
             self.env.close()
 
 
-def _require_finite(data: TensorDictBase, keys: list) -> None:
+def _require_finite(data: TensorDictBase, keys: Iterable[NestedKey]) -> None:
     """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
-    for key in [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]:
-        wrong = data[key].isfinite().logical_not()
-        if bool(wrong.any()):
-            bad = int(wrong.flatten(data.ndim).any(-1).sum())
-            raise FloatingPointError(
-                f"expected finite numbers, got others in {key!r} of {bad} of {data.numel()} samples; end "
-                "episodes before the simulation diverges"
-            )
+    names = [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]
+    finite = torch.stack([data[name].isfinite().all() for name in names]).tolist()  # fetched at once
+    for name in (name for name, good in zip(names, finite, strict=True) if not good):
+        wrong = data[name].isfinite().logical_not()
+        bad = int(wrong.flatten(data.ndim).any(-1).sum())
+        raise FloatingPointError(
+            f"expected finite numbers, got others in {name!r} of {bad} of {data.numel()} samples; end "
+            "episodes before the simulation diverges"
+        )

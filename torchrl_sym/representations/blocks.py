@@ -1,24 +1,81 @@
-"""The two kinds of matrix a representation is made of: signed permutations and small dense blocks.
+"""What a representation is made of: blocks, each of which says where every output entry comes from.
 
-Almost everything on a robot transforms by a signed permutation (joints change places and some change
-sign), which costs one gather and one multiplication and is exact in every precision. Vectors turned by
-120 degrees, and quaternions, need a small dense orthogonal block. A block knows its N matrices and how
-to apply them; :class:`~torchrl_sym.representations.Representation` strings blocks together.
+Under an element g, entry i of the image is a sum of a few entries of x, the *terms* of i:
+
+    y[i] = weight[g, i, 0] * x[index[g, i, 0]] + ... + weight[g, i, K - 1] * x[index[g, i, K - 1]]
+
+Almost everything on a robot has one term of weight +1 or -1 (joints change places and some change sign),
+which is exact in every precision. Vectors turned by 120 degrees have two, quaternions and rotation matrices
+up to nine. No block is ever a d x d matrix, so that a scan of a hundred thousand points costs its own size.
+
+Blocks are immutable. Arithmetic is exact to the data's own precision: weighted sums are taken in float64,
+which autocast and TF32 leave alone, and rounded once.
 """
 
 from __future__ import annotations
 
-import copy
 import itertools
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
+
+from torchrl_sym.representations.constants import Constants
 
 _TOLERANCE = 1e-9
-_DENSE_LIMIT = 16  # dense neighbours are merged up to this size: fewer calls, still cheap per row
+_NOISE = 1e-12  # what rounding leaves of a 0 or a 1
 
 
-class SignedPermutation(nn.Module):
+class _Block:
+    """N matrices of size d, by their terms.
+
+    Attributes:
+        index: source positions, ``(N, d)`` or ``(N, d, K)`` int64.
+        dim: the size d.
+        count: the number of terms K.
+    """
+
+    index: Tensor
+    dim: int
+    count: int
+
+    @property
+    def terms(self) -> tuple[Tensor, Tensor]:
+        """Source positions and weights, ``(N, d, K)``; entries with fewer terms have weights 0."""
+        raise NotImplementedError
+
+    def orbit(self, x: Tensor) -> Tensor:
+        return torch.stack([self.element(x, g) for g in range(len(self.index))])
+
+    def element(self, x: Tensor, g: int) -> Tensor:
+        """Image of ``(..., d)`` under one element; x itself where nothing changes."""
+        raise NotImplementedError
+
+    @property
+    def matrices(self) -> Tensor:
+        index, weight = self.terms
+        return weight.new_zeros(len(index), self.dim, self.dim).scatter_add(-1, index, weight)
+
+    def image_of_box(self, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Bounds ``(N, d)`` of the images of a box ``(d,)``; 0 * inf counts as 0."""
+        index, weight = self.terms
+        ends = [torch.where(weight == 0, 0.0, weight * bound[index]) for bound in (low, high)]
+        return torch.minimum(*ends).sum(-1), torch.maximum(*ends).sum(-1)
+
+    def components(self) -> Tensor:
+        """The smallest entry that each entry is exchanged or mixed with, ``(d,)``."""
+        index, _ = self.terms
+        label, found = torch.arange(self.dim, device="cpu"), None
+        while found is None or not torch.equal(label, found):
+            found, label = label, label[index].amin(dim=(0, 2))
+        return label
+
+    def select(self, elements: Tensor) -> Block:
+        index, weight = self.terms
+        return block_from_terms(index[elements], weight[elements])
+
+
+class SignedPermutation(_Block):
     """N signed permutations of d entries: ``y[i] = sign[g, i] * x[index[g, i]]``.
 
     Args:
@@ -26,142 +83,185 @@ class SignedPermutation(nn.Module):
         sign: +1 or -1 for every output entry, ``(N, d)``.
     """
 
-    index: Tensor
-    sign: Tensor
+    count = 1
 
     def __init__(self, index: Tensor, sign: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("index", index.long(), persistent=False)
-        # int8 keeps its meaning under module.half(); it is cast to the data's dtype on use
-        self.register_buffer("sign", sign.to(torch.int8), persistent=False)
+        self._constants = Constants(index.long(), sign.to(torch.int8))
+        self.index, self.sign = self._constants.tensors
         self.dim = index.shape[1]
-        self._moves = bool((index != torch.arange(self.dim)).any())
-        self._flips = bool((sign < 0).any())
+        stays = self.index == torch.arange(self.dim, device="cpu")
+        self._moves: list[bool] = (~stays.all(-1)).tolist()
+        self._flips: list[bool] = (self.sign < 0).any(-1).tolist()
+
+    @property
+    def terms(self) -> tuple[Tensor, Tensor]:
+        return self.index[..., None], self.sign[..., None].double()
+
+    @property
+    def is_trivial(self) -> bool:
+        """Whether every element leaves every entry."""
+        return not (any(self._moves) or any(self._flips))
 
     def element(self, x: Tensor, g: int) -> Tensor:
-        if self._moves:
-            x = x.index_select(-1, self.index[g])
-        return x * self._sign_like(x)[g] if self._flips else x
+        index, sign = self._constants.on(x.device)
+        if self._moves[g]:
+            x = x.index_select(-1, index[g])
+        return x * _like(x, sign[g]) if self._flips[g] else x
 
     def rows(self, x: Tensor, g: Tensor) -> Tensor:
+        index, sign = self._constants.on(x.device)
         element = g.flatten()  # selecting whole rows is three times as fast as indexing by g
-        if self._moves:
-            x = x.gather(-1, self.index.index_select(0, element).view(x.shape))
-        if self._flips:
-            x = x * self._sign_like(x).index_select(0, element).view(x.shape)
+        if any(self._moves):
+            x = x.gather(-1, index.index_select(0, element).view(x.shape))
+        if any(self._flips):
+            x = x * _like(x, sign).index_select(0, element).view(x.shape)
         return x
-
-    def orbit(self, x: Tensor) -> Tensor:
-        return torch.stack([self.element(x, g) for g in range(len(self.index))])
-
-    def _sign_like(self, x: Tensor) -> Tensor:
-        if not x.dtype.is_signed:
-            raise TypeError(f"expected signed numbers, got a {x.dtype} tensor: some entries change sign")
-        return self.sign.to(x.dtype)
 
     def product_residual(self, table: Tensor) -> Tensor:
         """Largest entry of rho(g) rho(h) - rho(gh) for all pairs: ``(N, N)``; 0 or more than 1."""
-        n, d = self.index.shape
-        index = self.index[:, None].expand(n, n, d)  # rho(g) outermost
-        product_index = self.index[None].expand(n, n, d).gather(-1, index)
-        product_sign = self.sign[:, None] * self.sign[None].expand(n, n, d).gather(-1, index)
-        wrong = (product_index != self.index[table]) | (product_sign != self.sign[table])
-        return wrong.any(-1).double()
+        wrong = []
+        for index, sign, products in zip(self.index, self.sign, table, strict=True):  # rho(g) outermost
+            moved = self.index[:, index] != self.index[products]
+            flipped = sign * self.sign[:, index] != self.sign[products]
+            wrong.append((moved | flipped).any(-1))
+        return torch.stack(wrong).double()
 
     def orthogonality_residual(self) -> Tensor:
-        return (self.index.sort(dim=-1).values != torch.arange(self.dim)).any(-1).double()
-
-    @property
-    def matrices(self) -> Tensor:
-        one_hot = nn.functional.one_hot(self.index, self.dim).double()
-        return one_hot * self.sign.double()[..., None]
-
-    def select(self, elements: Tensor) -> SignedPermutation:
-        return SignedPermutation(self.index[elements], self.sign[elements])
+        order = torch.arange(self.dim, device="cpu")
+        return (self.index.sort(dim=-1).values != order).any(-1).double()
 
     def absolute(self) -> SignedPermutation:
         return SignedPermutation(self.index, self.sign.abs())
 
-    @staticmethod
-    def join(blocks: list[SignedPermutation]) -> SignedPermutation:
-        """Direct sum of many, at once: one by one takes the square of the time."""
-        starts = itertools.accumulate(block.dim for block in blocks[:-1])
-        index = [block.index + start for block, start in zip(blocks, [0, *starts], strict=True)]
-        return SignedPermutation(torch.cat(index, dim=1), torch.cat([b.sign for b in blocks], dim=1))
+
+def _like(x: Tensor, sign: Tensor) -> Tensor:
+    if not x.dtype.is_signed:
+        raise TypeError(f"expected signed numbers, got a {x.dtype} tensor: some entries change sign")
+    return sign.to(x.dtype)
 
 
-class Dense(nn.Module):
-    """N orthogonal matrices, ``(N, d, d)`` float64."""
+class Mixing(_Block):
+    """N orthogonal matrices that mix entries, each a sum of up to K terms.
 
-    dense: Tensor
+    Args:
+        index: source positions, ``(N, d, K)`` int64.
+        weight: their weights, ``(N, d, K)`` float64; terms of weight 0 come last.
+    """
 
-    def __init__(self, matrices: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("dense", matrices.double(), persistent=False)
-        self.dim = matrices.shape[-1]
+    is_trivial = False
 
-    def element(self, x: Tensor, g: int) -> Tensor:
-        return x @ _like(x, self.dense[g]).mT
-
-    def rows(self, x: Tensor, g: Tensor) -> Tensor:
-        return (_like(x, self.dense)[g] @ x.unsqueeze(-1)).squeeze(-1)
-
-    def orbit(self, x: Tensor) -> Tensor:
-        return torch.stack([self.element(x, g) for g in range(len(self.dense))])
-
-    def product_residual(self, table: Tensor) -> Tensor:
-        products = torch.einsum("gij,hjk->ghik", self.dense, self.dense)
-        return (products - self.dense[table]).abs().amax(dim=(-2, -1))
-
-    def orthogonality_residual(self) -> Tensor:
-        eye = torch.eye(self.dim, dtype=torch.float64)
-        return (self.dense @ self.dense.mT - eye).abs().amax(dim=(-2, -1))
+    def __init__(self, index: Tensor, weight: Tensor) -> None:
+        self.dim, self.count = index.shape[1:]
+        used = (weight != 0).sum(-1, keepdim=True).clamp(min=1)
+        rank = torch.arange(self.count, device="cpu") - used + 1  # 0 at an entry's last own term
+        self.index = torch.where(rank > 0, index.gather(-1, used - 1), index)
+        self.weight = weight
+        # The last own term is shared out over unused ones as 1/2, 1/4, 1/4: their sum is exact, and no
+        # infinity of an entry that does not contribute is multiplied by 0.
+        share = weight.gather(-1, used - 1) * 0.5 ** torch.minimum(rank + 1, self.count - used)
+        shared = torch.where(rank < 0, weight, share)
+        self._constants = Constants(self.index.mT.contiguous(), shared.mT.contiguous())  # (N, K, d)
 
     @property
-    def matrices(self) -> Tensor:
-        return self.dense.double()
+    def terms(self) -> tuple[Tensor, Tensor]:
+        return self.index, self.weight
 
-    def select(self, elements: Tensor) -> Dense:
-        return Dense(self.dense[elements])
+    def element(self, x: Tensor, g: int) -> Tensor:
+        if g == 0:
+            return x
+        index, weight = self._on(x)
+        terms = [x.index_select(-1, index[g, k]) * weight[g, k] for k in range(self.count)]
+        return _sum(terms).to(x.dtype)
 
-    @staticmethod
-    def join(blocks: list[Dense]) -> Dense:
-        """Direct sum."""
-        rows = zip(*(block.dense for block in blocks), strict=True)
-        return Dense(torch.stack([torch.block_diag(*parts) for parts in rows]))
+    def rows(self, x: Tensor, g: Tensor) -> Tensor:
+        index, weight = (rows.index_select(0, g.flatten()) for rows in self._on(x))  # (rows, K, d)
+        terms = [
+            x.gather(-1, index[:, k].view(x.shape)) * weight[:, k].view(x.shape) for k in range(self.count)
+        ]
+        return torch.where((g == 0)[..., None], x, _sum(terms).to(x.dtype))
+
+    def _on(self, x: Tensor) -> tuple[Tensor, ...]:
+        if not x.dtype.is_floating_point:
+            raise TypeError(f"expected real numbers, got a {x.dtype} tensor: some entries are mixed")
+        return self._constants.on(x.device)
+
+    def product_residual(self, table: Tensor) -> Tensor:
+        """Largest entry of rho(g) rho(h) - rho(gh) for all pairs: ``(N, N)``."""
+        matrices = self.matrices
+        differences = [
+            (matrix @ matrices - matrices[products]).abs().amax(dim=(-2, -1))
+            for matrix, products in zip(matrices, table, strict=True)
+        ]
+        return torch.stack(differences)
+
+    def orthogonality_residual(self) -> Tensor:
+        eye = torch.eye(self.dim, dtype=torch.float64, device="cpu")
+        return torch.stack([(matrix @ matrix.mT - eye).abs().amax() for matrix in self.matrices])
 
 
-def _like(x: Tensor, matrices: Tensor) -> Tensor:
-    if not x.dtype.is_floating_point:
-        raise TypeError(f"expected real numbers, got a {x.dtype} tensor: some entries are mixed")
-    return matrices.to(x.dtype)
+def _sum(terms: Sequence[Tensor]) -> Tensor:
+    total = terms[0]
+    for term in terms[1:]:
+        total = total + term
+    return total
 
 
-Block = SignedPermutation | Dense
+Block = SignedPermutation | Mixing
 
 
 def block_from_matrices(matrices: Tensor) -> Block:
-    """A signed permutation if every matrix is one (to 1e-9), a dense block otherwise."""
-    matrices = torch.as_tensor(matrices, dtype=torch.float64)
+    """A signed permutation if every matrix is one (to 1e-9), a mixing block otherwise."""
+    matrices = matrices.double().cpu()
     size = matrices.abs()
     is_binary = ((size < _TOLERANCE) | ((size - 1).abs() < _TOLERANCE)).all()
     if is_binary and (size.round().sum(dim=-1) == 1).all():
         index = size.argmax(dim=-1)
         return SignedPermutation(index, matrices.gather(-1, index[..., None])[..., 0].sign())
-    return Dense(matrices)
+    whole = matrices.round()
+    matrices = torch.where((matrices - whole).abs() < _NOISE, whole, matrices)
+    return block_from_terms(torch.arange(matrices.shape[-1], device="cpu").expand_as(matrices), matrices)
 
 
-def merge(blocks: list[Block]) -> list[Block]:
-    """Join neighbouring blocks of one kind, so that a call does as few gathers as possible."""
-    runs: list[list[Block]] = []
-    size = 0  # of the last run
-    for block in blocks:
-        fits = isinstance(block, SignedPermutation) or size + block.dim <= _DENSE_LIMIT
-        if runs and type(block) is type(runs[-1][0]) and fits:
-            runs[-1].append(block)
-            size += block.dim
-        else:
-            runs.append([block])
-            size = block.dim
-    # copies, so that moving one representation moves no other
-    return [copy.deepcopy(run[0]) if len(run) == 1 else type(run[0]).join(run) for run in runs]  # pyright: ignore[reportArgumentType]
+def block_from_terms(index: Tensor, weight: Tensor) -> Block:
+    """The cheapest block with these terms, ``(N, d, K)``; those of weight 0 are left out."""
+    first = (weight == 0).to(torch.int8).sort(dim=-1, stable=True).indices  # terms that count
+    count = int((weight != 0).sum(-1).max()) if weight.numel() else 1
+    index, weight = (terms.gather(-1, first[..., :count]) for terms in (index, weight))
+    if count == 1 and ((weight.abs() - 1).abs() < _TOLERANCE).all():
+        return SignedPermutation(index[..., 0], weight[..., 0].sign())
+    return Mixing(index, weight)
+
+
+def join(blocks: Sequence[Block]) -> Block:
+    """Direct sum of many, at once: one by one takes the square of the time."""
+    if len(blocks) == 1:
+        return blocks[0]
+    starts = itertools.accumulate((block.dim for block in blocks[:-1]), initial=0)
+    if all(isinstance(block, SignedPermutation) for block in blocks):
+        index = [block.index + start for block, start in zip(blocks, starts, strict=True)]
+        return SignedPermutation(torch.cat(index, 1), torch.cat([block.sign for block in blocks], 1))
+    index, weight = zip(*(_padded(block, max(b.count for b in blocks)) for block in blocks), strict=True)
+    return Mixing(
+        torch.cat([i + start for i, start in zip(index, starts, strict=True)], 1), torch.cat(weight, 1)
+    )
+
+
+def _padded(block: Block, count: int) -> list[Tensor]:
+    return [torch.nn.functional.pad(terms, (0, count - block.count)) for terms in block.terms]
+
+
+def merge(blocks: Sequence[Block]) -> list[Block]:
+    """Join neighbouring blocks of as many terms, so that a call does as few gathers as possible."""
+    return [join(list(run)) for _, run in itertools.groupby(blocks, key=lambda block: block.count)]
+
+
+def product(outer: Block, inner: Sequence[Block]) -> Block:
+    """Tensor product, entries of ``inner`` running fastest: a block per outer entry, or one for all."""
+    count = max(block.count for block in inner)
+    index, weight = zip(*(_padded(block, count) for block in inner), strict=True)
+    inner_index, inner_weight = torch.stack(index, 1), torch.stack(weight, 1)  # (N, n | 1, v, L)
+    outer_index, outer_weight = (terms[:, :, None, :, None] for terms in outer.terms)  # (N, n, 1, K, 1)
+    size = inner[0].dim
+    whole = len(outer.index), outer.dim * size, outer.count * count
+    index = (outer_index * size + inner_index[..., None, :]).reshape(whole)
+    return block_from_terms(index, (outer_weight * inner_weight[..., None, :]).reshape(whole))

@@ -85,12 +85,12 @@ def quaternion(group: PointGroup, action: Action = "left", *, scalar_last: bool 
     turns = [_to_quaternion(m) for m in proper]
     left = torch.stack([_left_product(q) for q in turns])
     if action == "conjugate":
-        inverse = torch.tensor([1.0, -1, -1, -1], dtype=torch.float64)  # of this q, not of -q
+        inverse = torch.tensor([1.0, -1, -1, -1], dtype=torch.float64, device="cpu")  # of this q, not of -q
         matrices = left @ torch.stack([_right_product(inverse * q) for q in turns])
     else:
         matrices = _lift(group, left)
     if scalar_last:
-        order = torch.tensor([1, 2, 3, 0])
+        order = torch.tensor([1, 2, 3, 0], device="cpu")
         matrices = matrices[:, order][:, :, order]
     return Representation(group, matrices)
 
@@ -132,21 +132,25 @@ def _to_quaternion(matrix: Tensor) -> Tensor:
         [(xz - zx) / s, (xy + yx) / s, s / 4, (yz + zy) / s],
         [(yx - xy) / s, (xz + zx) / s, (yz + zy) / s, s / 4],
     ]
-    return torch.tensor(rows[largest], dtype=torch.float64)
+    return torch.tensor(rows[largest], dtype=torch.float64, device="cpu")
 
 
 def _left_product(q: Tensor) -> Tensor:
     w, x, y, z = q.tolist()
-    return torch.tensor([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64)
+    return torch.tensor(
+        [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64, device="cpu"
+    )
 
 
 def _right_product(q: Tensor) -> Tensor:
     w, x, y, z = q.tolist()
-    return torch.tensor([[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]], dtype=torch.float64)
+    return torch.tensor(
+        [[w, -x, -y, -z], [x, w, z, -y], [y, -z, w, x], [z, y, -x, w]], dtype=torch.float64, device="cpu"
+    )
 
 
 def _eye(group: PointGroup, size: int) -> Tensor:
-    return torch.eye(size, dtype=torch.float64).expand(group.order, size, size)
+    return torch.eye(size, dtype=torch.float64, device="cpu").expand(group.order, size, size)
 
 
 def _kron(a: Tensor, b: Tensor) -> Tensor:

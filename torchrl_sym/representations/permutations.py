@@ -1,8 +1,7 @@
-"""Builders for named entries and sampled fields: joints, actuators, feet, height maps.
+"""Builders for named entries: joints, actuators, feet, agents.
 
 Joint orders differ between simulators and even between releases of one robot's model, so permutations
-are written with names, never with positions. Fields sampled at points (height maps, range finders) need
-no table at all: the group moves the sample points, and the builder finds where each one lands.
+are written with names, never with positions.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations.base import Representation
 from torchrl_sym.representations.blocks import SignedPermutation
-from torchrl_sym.representations.vectors import _horizontal
+from torchrl_sym.representations.generators import from_generators
 
 
 def signed_permutation(
@@ -44,25 +43,16 @@ def signed_permutation(
     """
     check_group(group)
     names = checks.names("names", names)
-    known = {0: (torch.arange(len(names)), torch.ones(len(names), dtype=torch.int8))}
     given = {group.index(g): _parse(g, names, targets) for g, targets in _check_maps(maps).items()}
-    frontier = [0]
-    while frontier:  # walk the group from the identity by the given elements
-        h = frontier.pop()
-        for g, (index, sign) in given.items():
-            gh = int(group.table[g, h])
-            if gh not in known:
-                known[gh] = known[h][0][index], sign * known[h][1][index]
-                frontier.append(gh)
-    missing = [group.names[g] for g in range(group.order) if g not in known]
-    if missing:
-        raise ValueError(
-            f"the maps for {list(maps)} do not generate the group: no map for {missing}; add theirs"
-        )
-    known |= given  # a map that contradicts the products of the others is found by the check below
-    index = torch.stack([known[g][0] for g in range(group.order)])
-    sign = torch.stack([known[g][1] for g in range(group.order)])
+    stay = torch.arange(len(names), device="cpu"), torch.ones(len(names), dtype=torch.int8, device="cpu")
+    found = from_generators(group, given, stay, _after, "map")
+    index, sign = (torch.stack(parts) for parts in zip(*found, strict=True))
     return Representation.from_blocks(group, [SignedPermutation(index, sign)])
+
+
+def _after(g: tuple[Tensor, Tensor], h: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """First h, then g, each as source positions and signs."""
+    return h[0][g[0]], g[1] * h[1][g[0]]
 
 
 def permutation(
@@ -89,8 +79,8 @@ def _check_maps(maps: Mapping[str, Mapping[str, str]]) -> Mapping[str, Mapping[s
 
 
 def _parse(element: str, names: list[str], targets: Mapping[str, str]) -> tuple[Tensor, Tensor]:
-    index = torch.full((len(names),), -1)
-    sign = torch.ones(len(names), dtype=torch.int8)
+    index = torch.full((len(names),), -1, device="cpu")
+    sign = torch.ones(len(names), dtype=torch.int8, device="cpu")
     for source, target in targets.items():
         goal = target.removeprefix("-")
         for name in (source, goal):
@@ -109,81 +99,3 @@ def _parse(element: str, names: list[str], targets: Mapping[str, str]) -> tuple[
             f"{element!r} does not say where {absent} go; list entries that stay as themselves"
         )
     return index, sign
-
-
-def points(
-    group: PointGroup,
-    positions: Tensor | Sequence[Sequence[float]],
-    value: Representation | None = None,
-    *,
-    tolerance: float = 1e-6,
-) -> Representation:
-    """A field sampled at P points that move with the robot: height maps, range finders, foot forces.
-
-    The mirrored field has at ``R p`` what the original had at ``p``; a vector value is mapped as well.
-
-    Args:
-        group: the group that acts.
-        positions: sample points in the order of the tensor, ``(P, 2)`` or ``(P, 3)``, in metres, in the
-            frame that the group acts on.
-        value: how one sample transforms; entries are point-major, ``(P, value.dim)``. Defaults to a
-            scalar (one height per point).
-        tolerance: distance within which a point counts as found, in metres.
-
-    Raises:
-        ValueError: the layout is not closed under the group; the message names the element and point.
-
-    Example:
-        >>> ring = points(PointGroup.reflection("y"), [[1.0, 0.5], [1.0, -0.5], [2.0, 0.0]])
-        >>> ring(torch.tensor([10.0, 20.0, 30.0]), "reflect-y")
-        tensor([20., 10., 30.])
-    """
-    check_group(group)
-    tolerance = checks.real("tolerance", tolerance, 0.0)
-    positions = checks.array("positions", positions)
-    if positions.ndim != 2 or positions.shape[1] not in (2, 3) or len(positions) == 0:
-        raise ValueError(f"expected positions of shape (P, 2) or (P, 3), got {tuple(positions.shape)}")
-    turns = _horizontal(group) if positions.shape[1] == 2 else group.matrices
-    moved = positions @ turns.mT  # (N, P, 2|3)
-    distance, landing = torch.cdist(moved, positions.expand_as(moved)).min(dim=-1)
-    if (distance > tolerance).any():
-        g, i = (distance > tolerance).nonzero()[0].tolist()
-        raise ValueError(
-            f"the points are not closed under {group.names[g]!r}: point {i} at "
-            f"{_metres(positions[i])} is sent to {_metres(moved[g, i])}, where there is none; center "
-            "the layout on the axis of the group (for turns of 120 degrees use rings, not a grid)"
-        )
-    if (landing.sort(dim=-1).values != torch.arange(len(positions))).any():
-        raise ValueError(f"expected distinct points, got two within {tolerance} m of each other")
-    index = landing.argsort(dim=-1)  # entry landing[g, i] of the image comes from entry i
-    heights = Representation.from_blocks(group, [SignedPermutation(index, torch.ones_like(index))])
-    if value is None:
-        return heights
-    if checks.instance("value", value, Representation).group != group:
-        raise ValueError(f"expected a value of the same group, got {value.group}")
-    products = [torch.kron(a, b) for a, b in zip(heights.matrices, value.matrices, strict=True)]
-    return Representation(group, torch.stack(products))
-
-
-def height_map(
-    group: PointGroup, x: Sequence[float] | Tensor, y: Sequence[float] | Tensor
-) -> Representation:
-    """Heights on the grid ``x`` times ``y`` (metres, robot frame), x-major: entry ``i * len(y) + j``.
-
-    Raises:
-        ValueError: the grid is not closed under the group: off-center, or turned by less than 90 degrees.
-
-    Example:
-        >>> grid = height_map(PointGroup.klein_four(), x=[-0.1, 0.0, 0.1], y=[-0.1, 0.1])
-        >>> grid(torch.arange(6.0), "reflect-x")
-        tensor([4., 5., 2., 3., 0., 1.])
-    """
-    axes = [checks.array(name, values) for name, values in (("x", x), ("y", y))]
-    for name, lines in zip("xy", axes, strict=True):
-        if lines.ndim != 1 or len(lines) == 0:
-            raise ValueError(f"{name}: expected a list of coordinates, got shape {tuple(lines.shape)}")
-    return points(group, torch.cartesian_prod(*axes))
-
-
-def _metres(point: Tensor) -> str:
-    return "(" + ", ".join(f"{v:.4g}" for v in point.tolist()) + ")"

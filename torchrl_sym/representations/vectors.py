@@ -24,6 +24,7 @@ import torch
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.representations.base import MAX_DIM, Representation
+from torchrl_sym.representations.blocks import SignedPermutation
 
 
 def invariant(group: PointGroup, dim: int) -> Representation:
@@ -33,12 +34,14 @@ def invariant(group: PointGroup, dim: int) -> Representation:
         >>> invariant(PointGroup.reflection("y"), 4).dim
         4
     """
-    return scalar(group) * checks.whole("dim", dim, 1, MAX_DIM)
+    sign = torch.ones(check_group(group).order, checks.whole("dim", dim, 1, MAX_DIM), device="cpu")
+    index = torch.arange(sign.shape[1], device="cpu").expand_as(sign)
+    return Representation.from_blocks(group, [SignedPermutation(index, sign)], check=False)
 
 
 def scalar(group: PointGroup) -> Representation:
     """One entry that no element changes: time left, mass, a force's magnitude."""
-    return Representation(group, torch.ones(check_group(group).order, 1, 1))
+    return invariant(group, 1)
 
 
 def pseudoscalar(group: PointGroup) -> Representation:

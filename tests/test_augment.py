@@ -1,4 +1,4 @@
-"""SymmetryAugment on its own and behind collectors: layouts, elements, log-probabilities, refusals."""
+"""SymmetryAugment, a function of a batch: layouts, log-probabilities, refusals, collectors."""
 
 import copy
 import pickle
@@ -8,20 +8,15 @@ import pytest
 import torch
 from tensordict import LazyStackedTensorDict, TensorDict, TensorDictBase
 from torchrl.collectors import Collector, MultiSyncCollector
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer, Unbounded
 from torchrl.envs import Compose, DoubleToFloat, EnvBase, TransformedEnv
 from torchrl.modules import IndependentNormal, TanhNormal
 
+from tests.buffers import MAPPED, SHARED, drawn_elements, same
 from tests.networks import ACTION_DIM, GROUPS, OBSERVATION_DIM, make_actor, make_batch, make_symmetry
-from torchrl_sym import Symmetry, SymmetryAugment
+from torchrl_sym import SymmetryAugment, SymmetryOrbit
 
 K4 = GROUPS["K4"]
-MAPPED = ("observation", "action")
-SHARED = ("action_log_prob", "advantage", "value_target", "state_value")
-
-
-def same(actual: TensorDictBase, expected: TensorDictBase) -> bool:
-    return actual.batch_size == expected.batch_size and bool((actual == expected).all())
 
 
 every_symmetric_group = pytest.mark.parametrize("group", ["C1", "C2", "K4", "C3"])
@@ -97,38 +92,19 @@ def test_locked_and_lazy_batches(make):
     assert same(augment(make(batch.clone())), augment(batch))
 
 
-# --- random elements
+# --- where it is called from
 
 
-def drawn_elements(out: TensorDictBase, batch: TensorDictBase, symmetry: Symmetry) -> torch.Tensor:
-    """Which element each row was mapped by; fails unless every row is exactly one of its images."""
-    images = symmetry.orbit(batch)
-    matches = torch.stack([(images[key] == out[key]).all(-1) for key in MAPPED]).all(0)
-    assert (matches.sum(0) == 1).all()
-    return matches.long().argmax(0)
+def test_it_may_be_called_by_a_buffer():
+    class Averaging(ReplayBuffer):
+        """Computes something on the copies of what it samples; no business of its transform."""
 
+        def mean(self) -> torch.Tensor:
+            return SymmetryAugment(make_symmetry("K4"))(self.sample())["observation"].mean(0)
 
-@every_shape
-def test_random_maps_observation_and_action_of_a_row_by_one_element(shape):
-    batch, symmetry = make_batch(*shape), make_symmetry("K4")
-    out = SymmetryAugment(symmetry, elements="random")(batch)
-    assert drawn_elements(out, batch, symmetry).shape == shape
-    assert same(out.select(*SHARED), batch.select(*SHARED))
-
-
-def test_random_elements_are_uniform():
-    torch.manual_seed(0)
-    batch, symmetry = make_batch(4000), make_symmetry("K4")
-    out = SymmetryAugment(symmetry, elements="random")(batch)
-    count = drawn_elements(out, batch, symmetry).bincount(minlength=4)
-    chi_square = ((count - 1000) ** 2 / 1000).sum()
-    assert chi_square < 16.3  # one in a thousand with three degrees of freedom
-
-
-def test_random_elements_are_drawn_anew():
-    torch.manual_seed(0)
-    augment, batch = SymmetryAugment(make_symmetry("K4"), elements="random"), make_batch(64)
-    assert not same(augment(batch), augment(batch))
+    buffer = Averaging(storage=LazyTensorStorage(8), batch_size=8)
+    buffer.extend(make_batch(8))
+    assert buffer.mean()[:2].abs().max() < 1e-12  # K4 turns the first two around
 
 
 # --- select
@@ -232,7 +208,7 @@ def test_missing_entries_are_refused():
 
 
 def test_unknown_entries_are_refused():
-    with pytest.raises(KeyError, match="the batch has 'torque', which this symmetry does not know"):
+    with pytest.raises(KeyError, match=r"the batch has \['torque'\], which this symmetry does not know"):
         SymmetryAugment(make_symmetry())(make_batch(8).set("torque", torch.zeros(8, 2)))
 
 
@@ -248,6 +224,18 @@ def test_a_single_record_has_no_batch_to_grow():
 def test_extend_time_transforms_do_nothing_when_sampled():
     batch = make_batch(8)
     assert SymmetryAugment(make_symmetry(), when="extend")(batch) is batch
+    assert SymmetryAugment(make_symmetry(), when="sample").inv(batch).batch_size == batch.batch_size
+
+
+def test_a_single_record_has_no_place_for_copies_to_be_stored():
+    with pytest.raises(RuntimeError, match=r"no place .* use buffer.extend\(row.unsqueeze\(0\)\)"):
+        SymmetryAugment(make_symmetry(), when="extend").inv(make_batch(8)[0])
+
+
+def test_the_naive_rule_is_refused_where_it_would_meet_a_later_policy():
+    augment = SymmetryAugment(make_symmetry(), log_prob_from=make_actor())
+    with pytest.raises(RuntimeError, match=r"has changed by the time .* sampled; use when='extend'"):
+        ReplayBuffer(storage=LazyTensorStorage(8), transform=augment)
 
 
 # --- torch.compile
@@ -314,12 +302,20 @@ APPEND = {
 
 
 @pytest.mark.parametrize("append", APPEND.values(), ids=APPEND)
-@pytest.mark.parametrize("when", ["sample", "extend"])
-def test_environments_are_refused(append, when):
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda symmetry: SymmetryAugment(symmetry, when="sample"),
+        lambda symmetry: SymmetryAugment(symmetry, when="extend"),
+        lambda symmetry: SymmetryOrbit(symmetry).transform(),
+    ],
+    ids=["sample", "extend", "orbit"],
+)
+def test_environments_are_refused(append, make):
     with pytest.raises(
         RuntimeError, match=r"cannot be appended to an environment; use it in a replay buffer"
     ):
-        append(SymmetryAugment(make_symmetry(), when=when))
+        append(make(make_symmetry()))
 
 
 def collect(collector) -> TensorDictBase:
