@@ -94,7 +94,7 @@ def run_all(settings: Sequence[Setting], runs: Path, workers: int) -> None:
     missing = {setting: path for setting, path in missing.items() if not path.exists()}
     runs.mkdir(parents=True, exist_ok=True)
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, end_with_parent, max_tasks_per_child=1) as pool:
+    with ProcessPoolExecutor(workers, context, end_with_parent) as pool:
         futures = {pool.submit(run, *one): one[0].name for one in missing.items()}
         for future in as_completed(futures):
             future.result()

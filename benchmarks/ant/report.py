@@ -15,8 +15,8 @@ from plot import grid, legend
 ARMS = {"plain": "tab:orange", "symmetric": "tab:blue"}
 NAMES = {"sac": "SAC", "td3": "TD3"}
 PANELS = {
-    "return": "return of the deterministic policy",
-    "mirror_error": "mirror error of the policy",
+    "return": "return",
+    "mirror_error": "mirror error",
     "drift": "drift to one side (m)",
 }
 Curve = dict[str, np.ndarray]  # column: (evaluations,)
@@ -90,6 +90,7 @@ def picture(curves: Curves, path: Path) -> None:
                 for single in values:
                     axis.plot(steps, single, color=color, linewidth=0.4, alpha=0.5)
             axis.set(ylabel=what)
+            axis.locator_params(axis="x", integer=True)
         axes[0, column].set_title(f"{NAMES[algorithm]} on Ant-v5")
         axes[-1, column].set_xlabel("thousand environment steps of a seed")
         legend(axes[0, column])
