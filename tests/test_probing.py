@@ -32,7 +32,7 @@ from torchrl.envs import (
 )
 
 from torchrl_sym import PointGroup, SymmetricVecNorm, Symmetry
-from torchrl_sym.environments import transforms_of
+from torchrl_sym.environments.inside import transforms_of
 from torchrl_sym.representations import polar, scalar, signed_permutation
 
 pytestmark = [

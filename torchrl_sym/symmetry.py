@@ -21,11 +21,11 @@ from torchrl_sym import checks
 from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, enclosing, split, without_next
+from torchrl_sym.environments.probing import check_transforms
+from torchrl_sym.environments.specs import check_part, counter_names
+from torchrl_sym.environments.trial import Declared
 from torchrl_sym.groups import PointGroup, check_group
-from torchrl_sym.probing import check_transforms
 from torchrl_sym.representations import Representation
-from torchrl_sym.specs import check_part, counter_names
-from torchrl_sym.trial import Declared
 
 Elements = Literal["all", "random"] | Sequence[str]
 

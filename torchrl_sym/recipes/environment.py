@@ -13,7 +13,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 
 from torchrl.envs import EnvBase
 
-from torchrl_sym.environments import bare
+from torchrl_sym.environments.inside import bare
 
 
 class MakeEnv(Protocol):

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter
 
 from torchrl_sym.declaration import check_events
 from torchrl_sym.entries import split
-from torchrl_sym.environments import transforms_of
+from torchrl_sym.environments.inside import transforms_of
 from torchrl_sym.representations import Representation
 
 

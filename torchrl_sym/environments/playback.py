@@ -20,7 +20,7 @@ from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
 from torchrl.envs import Compose, EnvBase, Transform, TransformedEnv, step_mdp
 
-from torchrl_sym.environments import bare
+from torchrl_sym.environments.inside import bare
 
 
 class Layout:

@@ -3,8 +3,8 @@
 What a symmetry declares is what an environment gives out and takes in, behind all of its transforms. A
 transform in between may spoil it: measured constants, running statistics, a clip that is wider on one side.
 It may be of any class, the user's own, in front of a concatenation, or inside a worker. So all of them are
-tried out (:mod:`torchrl_sym.trial`), shell by shell down to the bare environment. Where that is impossible,
-only transforms that are known to keep statistics of each entry by itself are refused.
+tried out (:mod:`torchrl_sym.environments.trial`), shell by shell down to the bare environment. Where that
+is impossible, only transforms that are known to keep statistics of each entry by itself are refused.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from collections.abc import Sequence
 from tensordict import NestedKey
 from torchrl.envs import EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
-from torchrl_sym.environments import inside, shell, undisturbed
-from torchrl_sym.trial import Declared, Trial
+from torchrl_sym.environments.inside import inside, shell, undisturbed
+from torchrl_sym.environments.trial import Declared, Trial
 
 _REMEDY = (
     "use SymmetricVecNorm (or SymmetricNorm inside networks) for running statistics, and constants that "

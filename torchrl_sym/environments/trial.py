@@ -20,7 +20,7 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.envs import Transform, TransformedEnv
 
-from torchrl_sym.playback import Layout, copies, play
+from torchrl_sym.environments.playback import Layout, copies, play
 
 Image = Callable[[TensorDictBase, int], TensorDictBase]
 """The image of declared entries under an element, by index."""
