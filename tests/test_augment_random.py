@@ -4,13 +4,14 @@ import copy
 
 import pytest
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch.utils._python_dispatch import TorchDispatchMode
+from torchrl.data import LazyTensorStorage
 
 from tests.buffers import MAPPED, drawn_elements, same
 from tests.networks import make_batch, make_symmetry
-from torchrl_sym import Symmetry, SymmetryAugment
-from torchrl_sym.representations import invariant
+from torchrl_sym import PointGroup, Symmetry, SymmetryAugment, SymmetryReplayBuffer
+from torchrl_sym.representations import invariant, pseudoscalar
 
 every_shape = pytest.mark.parametrize("shape", [(8,), (8, 4)], ids=str)
 
@@ -167,3 +168,37 @@ def test_moving_the_transform_leaves_the_symmetry_to_its_owner():
     assert not list(augment.modules())[1:] and not augment.state_dict()
     augment.to("meta").to(torch.bfloat16)
     assert augment.symmetry is symmetry and same(augment(batch), expected)
+
+
+GROUP = PointGroup.reflection("y")
+RECURRENT = Symmetry(GROUP, {"observation": pseudoscalar(GROUP), "recurrent_state": invariant(GROUP, 2)})
+
+
+def recurrent_batch(*size: int, stored: float) -> TensorDict:
+    td = TensorDict(
+        observation=torch.ones(*size, 1), recurrent_state=torch.ones(*size, 1, 2), batch_size=size
+    )
+    td["recurrent_state"][:, 0] = stored
+    td["is_init"] = torch.zeros(*size, 1, dtype=torch.bool)
+    td["is_init"][:, 0] = stored == 0
+    return td
+
+
+@pytest.mark.parametrize("elements", ["all", "random"])
+def test_copies_of_sequences_begin_from_zero_memory_or_are_refused(elements):
+    augment = SymmetryAugment(RECURRENT, elements=elements)
+    torch.manual_seed(0)
+    out = augment(recurrent_batch(8, 3, stored=0.0))
+    mirrored = out["observation"][:, 0, 0] < 0
+    assert mirrored.any() and not mirrored.all()
+    assert (out["recurrent_state"][mirrored] == 0).all()
+    assert (out["recurrent_state"][~mirrored, 1:] == 1).all()
+    with pytest.raises(ValueError, match="stored memory that is not zero"):
+        augment(recurrent_batch(8, 3, stored=1.0))
+
+
+def test_flat_slices_with_a_stored_memory_are_refused_by_the_buffer():
+    buffer = SymmetryReplayBuffer(RECURRENT, storage=LazyTensorStorage(8), batch_size=4)
+    buffer.extend(recurrent_batch(8, 1, stored=1.0)[:, 0])
+    with pytest.raises(RuntimeError, match="leave it out of the buffer"):
+        buffer.sample()

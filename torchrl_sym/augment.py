@@ -9,6 +9,7 @@ depends on its settings and on the batch. :class:`~torchrl_sym.SymmetryReplayBuf
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, Literal, cast
 
@@ -20,6 +21,8 @@ from torch import Tensor
 from torchrl.envs.transforms import Transform
 
 from torchrl_sym import checks
+from torchrl_sym.entries import split
+from torchrl_sym.memory import Memory, is_recurrent_state, memory_by_name
 from torchrl_sym.symmetry import Elements, Symmetry, check_batch, check_symmetry
 
 TRAJECTORY = ("collector", "traj_ids")
@@ -115,6 +118,7 @@ class SymmetryAugment(Transform):
         self.select = select
         # the caller's, not submodules: collectors move their postproc
         self.__dict__.update(symmetry=symmetry, log_prob_from=log_prob_from)
+        self.memory = memory_by_name(symmetry)
 
     def set_container(self, container: Any) -> None:
         """Refuse environments: they have one action per state, so no batch to grow."""
@@ -162,13 +166,14 @@ class SymmetryAugment(Transform):
                 "expected at least one batch dimension, got batch size []; use td.unsqueeze(0)"
             )
         check_declared(self.symmetry, td, self.select)
+        check_memory(self.memory, tensordict)
         if self.random:
             element = self._draw(td, trajectories=tensordict.get(TRAJECTORY, None))
-            out = self.symmetry(td, element)
+            out = self.memory.rebuild(self.symmetry.per_row(td, element), element)
             self._reevaluate(out, originals=0)
             separate_trajectories(out, self.symmetry.group.order, element)
             return out
-        orbit = self.symmetry.orbit(td, self.elements)
+        orbit = self.memory.rebuild(self.symmetry.orbit(td, self.elements))
         self._reevaluate(orbit, originals=1)
         separate_trajectories(orbit, len(self.elements))
         return self._laid_out(orbit, td.names)
@@ -231,6 +236,15 @@ def check_declared(
         )
 
 
+def check_memory(memory: Memory, td: TensorDictBase) -> None:
+    """ValueError if copies of a batch would begin from a memory that they do not have."""
+    if any(td.get(key, None) is not None for key in memory.rebuilt):
+        resets = tuple(key for key in memory.resets if td.get(key, None) is not None)
+        memory = dataclasses.replace(memory, resets=resets)
+        time = td.names.index("time") if "time" in td.names else td.batch_dims - 1
+        memory.prepare(td.transpose(time, -1) if td.batch_dims > 1 else td, [("collector", "mask")])
+
+
 def separate_trajectories(td: TensorDictBase, count: int, copy: Tensor | None = None) -> None:
     """Make copies trajectories of their own: slices must not run from one into the next.
 
@@ -261,5 +275,4 @@ def refuse_environment(transform: Transform) -> None:
 
 def _has_memory(td: TensorDictBase) -> bool:
     """Whether a recurrent network may read this batch: it has ``is_init`` or a recurrent state."""
-    leaves = [key if isinstance(key, str) else key[-1] for key in td.keys(True, True)]
-    return any(leaf == "is_init" or "recurrent_state" in leaf for leaf in leaves)
+    return any(split(key)[1] == "is_init" or is_recurrent_state(key) for key in td.keys(True, True))

@@ -28,6 +28,7 @@ from tensordict.utils import unravel_key
 from torch import Tensor
 
 from torchrl_sym import checks
+from torchrl_sym.entries import join, split
 from torchrl_sym.symmetry import Symmetry
 
 _REMEDIES = (
@@ -232,6 +233,19 @@ class Memory:
             value = batch.get(key, None)
             empty = empty & (value is not None and (_per_step(value, batch) == 0).all(-1))
         return empty
+
+
+def memory_by_name(symmetry: Symmetry) -> Memory:
+    """The memory that a symmetry declares invariant, where no network is at hand: by TorchRL's names."""
+    keys = [key for key in symmetry.keys() if is_recurrent_state(key)]  # noqa: SIM118
+    rebuilt = [key for key in keys if symmetry[key].is_trivial]
+    resets = _distinct(join(split(key)[0], "is_init") for key in rebuilt)
+    return Memory(tuple(rebuilt), tuple(resets), 0, bool(rebuilt))
+
+
+def is_recurrent_state(key: NestedKey) -> bool:
+    """Whether TorchRL's recurrent modules keep their memory under this name, unless told otherwise."""
+    return "recurrent_state" in split(key)[1]
 
 
 def memory_keys(network: TensorDictModuleBase) -> list[NestedKey]:

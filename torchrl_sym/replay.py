@@ -36,10 +36,12 @@ from torchrl_sym.augment import (
     TRAJECTORY,
     SymmetryAugment,
     check_declared,
+    check_memory,
     refuse_environment,
     same_along,
     separate_trajectories,
 )
+from torchrl_sym.memory import memory_by_name
 from torchrl_sym.symmetry import Elements, Symmetry, check_symmetry
 
 Index = Tensor | tuple[Tensor, ...]
@@ -183,6 +185,7 @@ class _OrbitTransform(Transform):
     def __init__(self, orbit: SymmetryOrbit) -> None:
         super().__init__(in_keys=orbit.symmetry.keys(), out_keys=orbit.symmetry.keys())
         self.orbit = orbit
+        self.memory = memory_by_name(orbit.symmetry)
         self.paired = False
 
     def set_container(self, container: Any) -> None:
@@ -203,9 +206,23 @@ class _OrbitTransform(Transform):
         symmetry = self.orbit.symmetry
         check_declared(symmetry, tensordict)
         element = element.to(next(iter(tensordict.values(True, True))).device)
-        out = symmetry(tensordict, expand_right(element, tensordict.batch_size))
+        element = expand_right(element, tensordict.batch_size)
+        self._check_memory(tensordict)
+        out = self.memory.rebuild(symmetry.per_row(tensordict, element), element)
         separate_trajectories(out, symmetry.group.order, element)
         return out
+
+    def _check_memory(self, td: TensorDictBase) -> None:
+        if td.batch_dims > 1:
+            return check_memory(self.memory, td)
+        stored = [key for key in self.memory.rebuilt if td.get(key, None) is not None]
+        if stored:
+            raise RuntimeError(
+                f"slices in a flat batch have the stored memory {stored}, which copies do not have: leave "
+                "it out of the buffer, so that networks begin every slice from zero memory, or store "
+                "sequences [T] that begin where episodes do as records"
+            )
+        return None
 
 
 class SymmetryReplayBuffer(TensorDictReplayBuffer):
