@@ -49,4 +49,4 @@ def assert_close(actual: torch.Tensor, expected: torch.Tensor, atol: float = 1e-
 
 def scattered(group: PointGroup) -> torch.Tensor:
     """One point in general position and all of its images: ``(N, 3)``."""
-    return group.matrices @ torch.tensor([0.3, 0.1, 0.7], dtype=torch.float64)
+    return group.matrices @ torch.tensor([0.3, 0.1, 0.7], dtype=torch.float64, device="cpu")

@@ -105,8 +105,8 @@ class SignedPermutation(_Block):
     def element(self, x: Tensor, g: int) -> Tensor:
         index, sign = self._constants.on(x.device)
         if self._moves[g]:
-            x = x.index_select(-1, index[g])
-        return x * _like(x, sign[g]) if self._flips[g] else x
+            x = x.index_select(-1, index.select(0, g))
+        return x * _like(x, sign.select(0, g)) if self._flips[g] else x
 
     def rows(self, x: Tensor, g: Tensor) -> Tensor:
         index, sign = self._constants.on(x.device)
@@ -160,7 +160,8 @@ class Mixing(_Block):
         # infinity of an entry that does not contribute is multiplied by 0.
         share = weight.gather(-1, used - 1) * 0.5 ** torch.minimum(rank + 1, self.count - used)
         shared = torch.where(rank < 0, weight, share)
-        self._constants = Constants(self.index.mT.contiguous(), shared.mT.contiguous())  # (N, K, d)
+        by_term = [terms.movedim(-1, 0).contiguous() for terms in (self.index, shared)]  # (K, N, d)
+        self._constants = Constants(*by_term)
 
     @property
     def terms(self) -> tuple[Tensor, Tensor]:
@@ -169,16 +170,15 @@ class Mixing(_Block):
     def element(self, x: Tensor, g: int) -> Tensor:
         if g == 0:
             return x
-        index, weight = self._on(x)
-        terms = [x.index_select(-1, index[g, k]) * weight[g, k] for k in range(self.count)]
-        return _sum(terms).to(x.dtype)
+        terms = zip(*(each.select(1, g) for each in self._on(x)), strict=True)
+        return _sum([x.index_select(-1, index) * weight for index, weight in terms]).to(x.dtype)
 
     def rows(self, x: Tensor, g: Tensor) -> Tensor:
-        index, weight = (rows.index_select(0, g.flatten()) for rows in self._on(x))  # (rows, K, d)
-        terms = [
-            x.gather(-1, index[:, k].view(x.shape)) * weight[:, k].view(x.shape) for k in range(self.count)
-        ]
-        return torch.where((g == 0)[..., None], x, _sum(terms).to(x.dtype))
+        element, terms = g.flatten(), []
+        for index, weight in zip(*self._on(x), strict=True):
+            source = x.gather(-1, index.index_select(0, element).view(x.shape))
+            terms.append(source * weight.index_select(0, element).view(x.shape))
+        return torch.where((g == 0).unsqueeze(-1), x, _sum(terms).to(x.dtype))
 
     def _on(self, x: Tensor) -> tuple[Tensor, ...]:
         if not x.dtype.is_floating_point:
