@@ -14,6 +14,7 @@ from statistics import median
 from typing import Any
 
 import torch
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import tasks
 from measuring import interleave, ratio
@@ -64,7 +65,7 @@ def our_update(config: PPOConfig, make_env: Callable) -> Callable[[], object]:
     env = make_env(num_envs=config.num_envs, seed=0)
     actor, critic = make_networks(config, env, env.symmetry)
     learner = Learner(config, actor, critic, env.symmetry)
-    with torch.no_grad():
+    with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
         data = env.rollout(config.horizon, actor, break_when_any_done=False)
     return functools.partial(learner.fit, learner.estimate(data))
 
