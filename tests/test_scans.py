@@ -6,10 +6,10 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 from torchrl.data import Bounded
-from torchrl_sym.specs import check_box
 
 from tests.point_groups import GROUPS, assert_close, random
 from torchrl_sym import PointGroup
+from torchrl_sym.environments.specs import check_box
 from torchrl_sym.representations import axial, height_map, invariant, items, points, polar, pseudoscalar
 from torchrl_sym.representations.nearest import nearest
 from torchrl_sym.testing import assert_representation

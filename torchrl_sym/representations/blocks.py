@@ -239,7 +239,7 @@ def join(blocks: Sequence[Block]) -> Block:
     starts = itertools.accumulate((block.dim for block in blocks[:-1]), initial=0)
     if all(isinstance(block, SignedPermutation) for block in blocks):
         index = [block.index + start for block, start in zip(blocks, starts, strict=True)]
-        return SignedPermutation(torch.cat(index, 1), torch.cat([block.sign for block in blocks], 1))
+        return SignedPermutation(torch.cat(index, 1), torch.cat([block.sign for block in blocks], 1))  # pyright: ignore[reportAttributeAccessIssue]
     index, weight = zip(*(_padded(block, max(b.count for b in blocks)) for block in blocks), strict=True)
     return Mixing(
         torch.cat([i + start for i, start in zip(index, starts, strict=True)], 1), torch.cat(weight, 1)
