@@ -7,8 +7,8 @@ Four runs, {SAC, TD3} x {plain, symmetric}, of five seeds each (`ant/training.py
 algorithm differ in one thing: the symmetric one maps every sampled row by one random element of {e,
 reflect-y} before the loss sees it. Networks, hyper-parameters, frames, updates and rows per update are
 equal, and so are, seed by seed, the initial networks and the seeds of the environments, which is why
-differences are taken in pairs. Hyper-parameters were chosen on the plain arm with other seeds (100 and
-above).
+differences are taken in pairs. Settings were chosen with other seeds (100 and above), the first of them
+in pilots of either arm, the last ones on the plain arm.
 
 The rules, written before the study ran:
 
@@ -34,6 +34,7 @@ import csv
 import dataclasses
 import json
 import multiprocessing
+import os
 import platform
 import time
 from collections.abc import Sequence
@@ -109,9 +110,11 @@ def collect(settings: Sequence[Setting], runs: Path, results: Path) -> None:
     rows = [row for path in paths for row in csv.DictReader(path.read_text().splitlines())]
     study = {
         "command": "python benchmarks/off_policy.py",
-        "setting": dataclasses.asdict(settings[0]),
+        "setting": {
+            k: v for k, v in dataclasses.asdict(settings[0]).items() if k not in ("algorithm", "arm")
+        },
         "packages": {name: version(name) for name in PACKAGES} | {"python": platform.python_version()},
-        "machine": f"{platform.machine()}, one thread per run",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, one thread per run",
     }
     results.mkdir(parents=True, exist_ok=True)
     write(rows, results / "curves.csv")

@@ -17,12 +17,12 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage
 from torchrl.envs import Compose, DoubleToFloat, GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import SACLoss, SoftUpdate
 
-from torchrl_sym import PointGroup, Symmetry, SymmetryAugment
+from torchrl_sym import PointGroup, Symmetry, SymmetryReplayBuffer
 from torchrl_sym.mujoco import derive
 from torchrl_sym.representations import axial, polar, quaternion, scalar
 
@@ -67,11 +67,7 @@ loss = SACLoss(actor, qvalue, loss_function="l2", alpha_init=0.05, fixed_alpha=T
 loss.make_value_estimator(gamma=0.95)
 target = SoftUpdate(loss, tau=0.02)
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-buffer = TensorDictReplayBuffer(
-    storage=LazyTensorStorage(steps),
-    batch_size=128,
-    transform=SymmetryAugment(symmetry, elements="random"),
-)
+buffer = SymmetryReplayBuffer(symmetry, elements="random", storage=LazyTensorStorage(steps), batch_size=128)
 collector = Collector(
     env, actor, frames_per_batch=EPISODE, total_frames=steps, init_random_frames=min(RANDOM, steps // 2)
 )

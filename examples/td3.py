@@ -16,12 +16,12 @@ import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import LazyTensorStorage
 from torchrl.envs import Compose, DoubleToFloat, GymWrapper, RewardSum, TransformedEnv
 from torchrl.modules import MLP, AdditiveGaussianModule, ValueOperator
 from torchrl.objectives import SoftUpdate, TD3Loss
 
-from torchrl_sym import PointGroup, Symmetry, SymmetryOrbit
+from torchrl_sym import PointGroup, Symmetry, SymmetryReplayBuffer
 from torchrl_sym.mujoco import derive
 from torchrl_sym.representations import axial, polar, quaternion, scalar
 
@@ -62,10 +62,7 @@ loss = TD3Loss(actor, qvalue, loss_function="l2", action_spec=env.action_spec, d
 loss.make_value_estimator(gamma=0.95)
 target = SoftUpdate(loss, tau=0.02)
 optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-orbit = SymmetryOrbit(symmetry)
-buffer = TensorDictReplayBuffer(
-    storage=LazyTensorStorage(steps), batch_size=64, sample_unit=orbit, transform=orbit.transform()
-)
+buffer = SymmetryReplayBuffer(symmetry, storage=LazyTensorStorage(steps), batch_size=64)
 collector = Collector(
     env,
     TensorDictSequential(actor, noise),

@@ -1,5 +1,6 @@
 """The off-policy study: a symmetric task, seeds that do not mix, verdicts that follow from the table."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import torch
 from tensordict import TensorDict
 
 import off_policy
-from ant.report import late, read, table, verdict
+from ant.report import late, measured, page, read, verdict
 from ant.training import Learner, Setting
 from ant.world import ant_symmetry, evaluate, make_env, make_envs
 from comparison.intervals import Estimate
@@ -71,11 +72,11 @@ def test_measures_of_a_policy_whose_mirror_image_is_known(symmetry):
         mirrored = symmetry["action"]((symmetry["observation"](seen, 1) @ gain).tanh(), 1)
         return torch.stack([(action[0] + mirrored[0]) / 2, action[1]])
 
-    measured = evaluate(act, make_envs(4), symmetry, (0, 1))
-    assert measured["mirror_error"][0] < 1e-10 < 1e-3 < measured["mirror_error"][1]
-    assert set(measured) == {"return", "x", "y", "mirror_error"}
-    assert all(values.shape == (2,) for values in measured.values())
-    assert measured["return"][0] < 20.0 * measured["x"][0] + 5.0  # speed over 0.05 s steps, less effort
+    result = evaluate(act, make_envs(4), symmetry, (0, 1))
+    assert result["mirror_error"][0] < 1e-10 < 1e-3 < result["mirror_error"][1]
+    assert set(result) == {"return", "x", "y", "mirror_error"}
+    assert all(values.shape == (2,) for values in result.values())
+    assert result["return"][0] < 20.0 * result["x"][0] + 5.0  # speed over 0.05 s steps, less effort
 
 
 @pytest.fixture(scope="module")
@@ -142,10 +143,17 @@ def test_differences_are_taken_in_pairs():
     plain = {seed: curve(level[seed] + np.arange(4)) for seed in level}
     symmetric = {seed: curve(level[seed] + np.arange(4) + 1.0 + 0.1 * seed, 0.5) for seed in level}
     curves = {("sac", "plain"): plain, ("sac", "symmetric"): symmetric}
-    lines = table(curves, "sac").splitlines()
-    assert lines[2].endswith("| 1.2 (1.0 to 1.4) | helps |")
-    assert lines[3].endswith("| -0.50 (-0.50 to -0.50) | more symmetric |")
-    assert lines[4].endswith("| undecided |") and lines[5].endswith("| (no verdict) |")
+    area, mirror, drift, last = measured(curves, "sac")
+    assert area.format().endswith("| 1.2 (1.0 to 1.4) | helps |")
+    assert mirror.format().endswith("| -0.50 (-0.50 to -0.50) | more symmetric |")
+    assert (drift.verdict, last.verdict) == ("undecided", "")
     del symmetric[3]
     with pytest.raises(ValueError, match="expected both arms to have the same seeds"):
-        table(curves, "sac")
+        measured(curves, "sac")
+
+
+def test_the_page_says_what_the_stored_results_say():
+    results = ROOT / "benchmarks" / "results" / "off-policy"
+    text = page(read(results / "curves.csv"), json.loads((results / "study.json").read_text()))
+    advice = "run python benchmarks/off_policy.py --collect"
+    assert text == (ROOT / "docs" / "off_policy.md").read_text(), advice

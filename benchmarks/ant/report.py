@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import textwrap
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -54,9 +56,9 @@ def late(values: np.ndarray) -> float:
 # measure: column, figure of a curve, verdict if symmetric is higher, verdict if it is lower
 MEASURES: dict[str, tuple[str, Callable[[np.ndarray], float], str, str]] = {
     "area under the curve of returns": ("return", area, "helps", "hurts"),
-    "mirror error, last quarter": ("mirror_error", late, "less symmetric", "more symmetric"),
-    "drift, last quarter (m)": ("drift", late, "less straight", "straighter"),
-    "return, last quarter": ("return", late, "", ""),
+    "late mirror error": ("mirror_error", late, "less symmetric", "more symmetric"),
+    "late drift (m)": ("drift", late, "less straight", "straighter"),
+    "late return": ("return", late, "", ""),
 }
 
 
@@ -68,7 +70,7 @@ def figures(curves: dict[int, Curve], column: str, figure: Callable[[np.ndarray]
 def verdict(difference: Estimate, higher: str, lower: str) -> str:
     """What an interval of a paired difference says."""
     if not higher:
-        return "(no verdict)"
+        return ""
     return higher if difference.low > 0 else lower if difference.high < 0 else "undecided"
 
 
@@ -103,25 +105,44 @@ def picture(curves: Curves, path: Path) -> None:
     plt.close(figure)
 
 
-def table(curves: Curves, algorithm: str) -> str:
-    """Both arms, their paired difference and the verdict, a line per measure."""
-    plain, symmetric = curves[algorithm, "plain"], curves[algorithm, "symmetric"]
-    if list(plain) != list(symmetric):
+@dataclass(frozen=True)
+class Row:
+    """One measure of both arms."""
+
+    name: str
+    plain: Estimate
+    symmetric: Estimate
+    difference: Estimate
+    verdict: str
+
+    def format(self) -> str:
+        digits = 2 if max(abs(self.plain.value), abs(self.symmetric.value)) < 10 else 1
+        cells = [x.format(digits) for x in (self.plain, self.symmetric, self.difference)]
+        return f"| {self.name} | {' | '.join(cells)} | {self.verdict} |"
+
+
+def measured(curves: Curves, algorithm: str) -> list[Row]:
+    """Both arms, their paired difference and the verdict, by measure."""
+    arms = [curves[algorithm, arm] for arm in ARMS]
+    if len({tuple(own) for own in arms}) > 1:
         raise ValueError(
-            f"{algorithm}: expected both arms to have the same seeds, got {list(plain)} and "
-            f"{list(symmetric)}; train the ones that are missing"
+            f"{algorithm}: expected both arms to have the same seeds, got {[list(own) for own in arms]}; "
+            "train the ones that are missing"
         )
-    lines = [
-        "| measure | plain | symmetric | symmetric minus plain, in pairs | verdict |",
-        "|---|---|---|---|---|",
-    ]
+    rows = []
     for name, (column, figure, higher, lower) in MEASURES.items():
-        a, b = (figures(own, column, figure) for own in (plain, symmetric))
-        difference = estimate(b - a)
-        digits = 2 if max(abs(a).max(), abs(b).max()) < 10 else 1
-        cells = [estimate(a).format(digits), estimate(b).format(digits), difference.format(digits)]
-        lines.append(f"| {name} | " + " | ".join(cells) + f" | {verdict(difference, higher, lower)} |")
-    return "\n".join(lines)
+        plain, symmetric = (figures(own, column, figure) for own in arms)
+        difference = estimate(symmetric - plain)
+        word = verdict(difference, higher, lower)
+        rows.append(Row(name, estimate(plain), estimate(symmetric), difference, word))
+    return rows
+
+
+def table(rows: list[Row]) -> str:
+    head = (
+        "| measure | plain | symmetric | symmetric minus plain, in pairs | verdict |\n|---|---|---|---|---|"
+    )
+    return "\n".join([head, *(row.format() for row in rows)])
 
 
 INTRODUCTION = """\
@@ -130,8 +151,10 @@ INTRODUCTION = """\
 Made by `{command}` from [benchmarks/results/off-policy](../benchmarks/results/off-policy); a test compares.
 {packages}; {machine}; {hours:.1f} hours of one core in training.
 
+What came out: {found}.
+
 The Ant is rewarded for speed along x, so its mirror image in the plane y = 0 earns what it earns itself
-(`torchrl_sym.mujoco.verify` finds no difference above 1e-14). *Symmetric* replay maps every sampled row,
+(`torchrl_sym.mujoco.verify` says so). *Symmetric* replay maps every sampled row,
 state, action and next state together, by one random element of {{e, reflect-y}}; *plain* replay does not.
 All else is equal: {frames:,} frames of a seed from {envs} environments, {steps:,} gradient steps of
 {rows} rows, networks of two hidden layers of {cells}, and, seed by seed, initial networks and starts.
@@ -140,12 +163,14 @@ falls, so that a policy walks within ten thousand gradient steps (`benchmarks/an
 small budget, on purpose: the study says what symmetric replay does early in training, not where training
 ends.
 
-Numbers are interquartile means over seeds with 95 % bootstrap intervals. The rules, written before the
-first of these runs: the area under the curve of returns decides whether symmetric replay *helps* or
-*hurts*, which it does if the interval of the paired difference excludes zero; mirror error and drift say,
-by the same rule, whether the policy became *more symmetric* and walks *straighter*. Hyper-parameters were
-chosen on the plain arm, with other seeds. Five seeds are few: what is undecided here may be decided by
-more.
+Numbers are interquartile means over seeds with 95 % bootstrap intervals; *late* is the mean over the last
+quarter of the evaluations. The rules, written before the first of these runs: the area under the curve of
+returns decides whether symmetric replay *helps* or *hurts*, which it does if the interval of the paired
+difference excludes zero; mirror error (mean square over action entries of pi(L_g s) - K_g pi(s)) and
+drift (how far the episodes of an evaluation end on average to one side) say, by the same rule, whether
+the policy became *more symmetric* and walks *straighter*; the late return has no verdict. Settings were
+chosen with other seeds, the first of them on either arm, the last ones on the plain arm. Five seeds are
+few: what is undecided here may be decided by more.
 
 ![Curves](../benchmarks/plots/off-policy/curves.png)
 
@@ -165,8 +190,12 @@ def page(curves: Curves, study: dict) -> str:
         "steps": int(runs[0]["updates"][-1]),
     }
     setting = {name: value for name, value in study["setting"].items() if name not in facts}
-    parts = [INTRODUCTION.format(**facts, **setting)]
-    for algorithm, name in NAMES.items():
-        if {(algorithm, arm) for arm in ARMS} <= set(curves):
-            parts.append(f"## {name}\n\n{table(curves, algorithm)}")
+    rows = {name: measured(curves, name) for name in NAMES if all((name, arm) in curves for arm in ARMS)}
+    found = "; ".join(
+        f"{NAMES[name]}, " + ", ".join(f"{row.name}: *{row.verdict}*" for row in own if row.verdict)
+        for name, own in rows.items()
+    )
+    text = INTRODUCTION.format(found=found, **facts, **setting)
+    parts = [textwrap.fill(part, 106, break_on_hyphens=False) for part in text.split("\n\n")]
+    parts += [f"## {NAMES[name]}\n\n{table(own)}" for name, own in rows.items()]
     return "\n\n".join(parts) + "\n"
