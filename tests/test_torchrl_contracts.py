@@ -1,5 +1,10 @@
 """What we expect of TorchRL's private names."""
 
+import ast
+import inspect
+import textwrap
+
+import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler, TensorDictReplayBuffer
@@ -7,7 +12,42 @@ from torchrl.data.replay_buffers import Transition
 from torchrl.envs import RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
 
 from tasks import make_env
-from torchrl_sym._torchrl import buffers_sampling_by, cuts_by, serial_workers
+from torchrl_sym import (
+    MirrorLoss,
+    SymmetricClipPPOLoss,
+    SymmetricVecNorm,
+    SymmetryAugment,
+    SymmetryReplayBuffer,
+)
+from torchrl_sym._torchrl import INHERITED, buffers_sampling_by, cuts_by, serial_workers
+
+
+@pytest.mark.parametrize("parent", INHERITED, ids=lambda parent: parent.__name__)
+def test_private_methods_are_as_they_were(parent):
+    for name, arguments in INHERITED[parent].items():
+        member = inspect.getattr_static(parent, name)
+        if arguments is None:
+            assert isinstance(member, property), name
+        else:
+            assert list(inspect.signature(member).parameters)[1:] == arguments, name
+
+
+@pytest.mark.parametrize(
+    "child",
+    [SymmetricClipPPOLoss, MirrorLoss, SymmetryReplayBuffer, SymmetryAugment, SymmetricVecNorm],
+    ids=lambda child: child.__name__,
+)
+def test_all_that_a_class_takes_from_its_parent_is_listed(child):
+    """What its source reads of itself, or defines, and its parent has under a private name."""
+    parent = child.__mro__[1]
+    tree = ast.parse(textwrap.dedent(inspect.getsource(child)))
+    read = {node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)}
+    defined = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
+    private = {name for name in read | defined if name.startswith("_") and not name.startswith("__")}
+    taken = {name for name in private if inspect.getattr_static(parent, name, None) is not None}
+    of_torch = {name for name in taken if name in dir(torch.nn.Module)}  # such as _apply
+    data = {"_AcceptedKeys", "_schedulable_buffers"}  # of TorchRL's documented way to write a loss
+    assert taken - of_torch - data == set(INHERITED[parent])
 
 
 def test_workers_of_a_serial_environment():

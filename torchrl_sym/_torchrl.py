@@ -4,9 +4,10 @@ TorchRL may change them in any release; ``tests/test_torchrl_contracts.py`` says
 """
 
 from tensordict import NestedKey
-from torchrl.data import ReplayBuffer
+from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
-from torchrl.envs import EnvBase, SerialEnv
+from torchrl.envs import EnvBase, SerialEnv, Transform, VecNormV2
+from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
 )
@@ -15,12 +16,44 @@ from torchrl.objectives.ppo import (
 )
 
 __all__ = [
+    "INHERITED",
     "broadcast_advantage_to_log_weight",
     "buffers_sampling_by",
     "check_advantage_broadcast",
     "cuts_by",
     "serial_workers",
 ]
+
+# What our subclasses take from their parents or put in their place, by parent, with its arguments.
+INHERITED: dict[type, dict[str, list[str] | None]] = {
+    ClipPPOLoss: {
+        "_cached_critic_network_params_detached": None,
+        "_clear_weakrefs": ["tds"],
+        "_clip_bounds": None,
+        "_critic_loss_inputs": ["target_return", "state_value", "old_state_value"],
+        "_get_entropy": ["dist", "adv_shape"],
+        "_log_weight": ["tensordict", "adv_shape"],
+        "_loss_mask_keys": [],
+        "_maybe_normalize_advantage": ["advantage", "tensordict", "update_norm"],
+        "_reduce_loss": ["loss", "tensordict", "mask", "reduction", "weights"],
+        "_weighted_loss_entropy": ["entropy"],
+    },
+    LossModule: {
+        "_clear_weakrefs": ["tds"],
+        "_forward_value_estimator_keys": ["kwargs"],
+        "_loss_mask_keys": [],
+        "_reduce_loss": ["loss", "tensordict", "mask", "reduction", "weights"],
+    },
+    TensorDictReplayBuffer: {"_sample": ["args", "kwargs"]},
+    Transform: {"_inv_call": ["tensordict"]},
+    VecNormV2: {
+        "_get_loc_scale": ["loc_only"],
+        "_maybe_stateful_init": ["data"],
+        "_norm": ["data", "loc", "var", "count"],
+        "_stateful_norm": ["data"],
+        "_stateful_update": ["data"],
+    },
+}
 
 
 def serial_workers(env: SerialEnv) -> list[EnvBase]:
