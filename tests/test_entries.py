@@ -240,3 +240,67 @@ def test_counters_need_no_declaration(kind):
     env = make() if kind is None else kind(2, make)
     tasks.make_env("cartpole", num_envs=1, num_threads=1).symmetry.check_specs(env)
     env.close(raise_if_closed=False)
+
+
+# --- what belongs to entries that change places
+
+
+TWO = {"left": torch.tensor([[1.0, 2.0]]), "right": torch.tensor([[3.0, 4.0]])}
+
+
+@pytest.mark.parametrize("form", ["items", "sum"])
+@pytest.mark.parametrize("event", [(), (1,), (2,), (2, 1)], ids=str)
+def test_log_probabilities_of_two_heads_change_places_as_their_actions_do(form, event):
+    both = items(PLACES, ARM)
+    symmetry = Symmetry(GROUP, {Exchanged("left", "right"): both if form == "items" else both.flatten()})
+    scores = {f"{name}_log_prob": torch.randn(1, *event) for name in TWO}
+    td = TensorDict(TWO | scores, batch_size=[1])
+    ones = torch.ones(1, dtype=torch.long)
+    for image in (symmetry(td, 1), symmetry.orbit(td)[1], symmetry(td, ones)):
+        assert torch.equal(image["left_log_prob"], scores["right_log_prob"])
+        assert torch.equal(image["right_log_prob"], scores["left_log_prob"])
+    with pytest.raises(KeyError, match=r"lacks \['right_log_prob'\], which change places"):
+        symmetry(td.exclude("right_log_prob"), 1)
+
+
+@pytest.mark.parametrize("form", ["items", "sum"])
+def test_what_is_in_groups_that_change_places_does_so_too(form):
+    both = items(PLACES, ARM) if form == "items" else items(PLACES, ARM).flatten()
+    actions = Exchanged(("left", "action"), ("right", "action"))
+    symmetry = Symmetry(GROUP, {actions: both, Exchanged(("left", "q"), ("right", "q")): both})
+    torch.manual_seed(0)
+    shapes = {"q": (2,), "action": (2,), "loc": (2,), "scale": (2,), "action_log_prob": (), "done": (1,)}
+    sides = {
+        side: TensorDict({k: torch.randn(3, *v) for k, v in shapes.items()}, batch_size=[3]) for side in TWO
+    }
+    after = {side: TensorDict(q=torch.randn(3, 2), reward=torch.randn(3, 1)) for side in TWO}
+    td = TensorDict(**sides, next=TensorDict(after), reward=torch.randn(3, 1), batch_size=[3])
+    image, signs = symmetry(td, 1), torch.tensor([-1.0, 1.0])
+    for here, there in (("left", "right"), ("right", "left")):
+        for name in ("q", "action", "loc"):
+            assert torch.equal(image[here, name], td[there, name] * signs)
+        for name in ("scale", "action_log_prob", "done"):
+            assert torch.equal(image[here, name], td[there, name])
+        assert torch.equal(image["next", here, "reward"], td["next", there, "reward"])
+    assert torch.equal(image["reward"], td["reward"])
+    assert symmetry.together([("next", "left", "reward")]) == [
+        ("next", "left", "reward"),
+        ("next", "right", "reward"),
+    ]
+    assert symmetry.together(["left"]) == ["left", "right"]
+
+
+def test_groups_that_stay_in_place_keep_what_is_in_them():
+    stay = Exchanged(("left", "action"), ("right", "action"))
+    symmetry = Symmetry(GROUP, {stay: items(invariant(GROUP, 2), ARM)})
+    td = TensorDict({(side, "action"): value for side, value in TWO.items()}, batch_size=[1])
+    td["left", "reward"], td["right", "reward"] = torch.tensor([1.0]), torch.tensor([2.0])
+    assert symmetry(td, 1)["left", "reward"] == 1
+
+
+def test_groups_of_different_sizes_have_no_place_for_what_is_in_them():
+    symmetry = Symmetry(GROUP, {Exchanged(("left", "action"), ("right", "action")): ARM + SIGN})
+    td = TensorDict({("left", "action"): torch.ones(1, 2), ("right", "action"): torch.ones(1, 1)}, [1])
+    td["left", "reward"], td["right", "reward"] = torch.tensor([1.0]), torch.tensor([2.0])
+    with pytest.raises(KeyError, match="not items of one size"):
+        symmetry(td, 1)

@@ -66,7 +66,7 @@ class Declaration:
                 spelling[key] = declared
                 self.position[key] = len(self.parts) - 1
         self._check_sides(group)
-        self._followers: dict[tuple[NestedKey, torch.Size], Representation | None] = {}
+        self._followers: dict[tuple[NestedKey, torch.Size, NestedKey | None], Part | None] = {}
 
     @property
     def keys(self) -> list[NestedKey]:
@@ -79,9 +79,16 @@ class Declaration:
         if bare not in self.position:
             return None
         names, representation = self.parts[self.position[bare]]
-        if unravel_key(key) != bare:
-            names = [join(("next", *split(name)[0]), split(name)[1]) for name in names]
-        return names, representation
+        return _as_spelled(key, names), representation
+
+    def together(self, key: NestedKey) -> list[NestedKey]:
+        """An entry, and those that it changes places with."""
+        bare = without_next(key)
+        if bare in self.position:
+            names = self.parts[self.position[bare]][0]
+        else:
+            names, _ = self._exchanged(bare) or ([bare], None)
+        return [key] if len(names) == 1 else _as_spelled(key, names)
 
     def mapped(
         self,
@@ -120,12 +127,15 @@ class Declaration:
                 continue
             event = value.shape[batch.batch_dims :] if isinstance(value, Tensor) else None
             try:
-                follower = self._follower(key, event, (followers or {}).get(key))
+                part = self._follower(key, event, (followers or {}).get(key))
             except _Unknown:
                 unknown += [key] if strict else []
                 continue
-            if follower is not None:
-                parts.append(([key], follower))
+            if part is not None:
+                names = _as_spelled(key, part[0])
+                _check_events(batch, names, part[1])
+                parts.append((names, part[1]))
+                done |= set(names)
         if unknown:
             raise KeyError(
                 f"the batch has {unknown}, which this symmetry does not know (it has {self.keys}); add "
@@ -134,39 +144,65 @@ class Declaration:
             )
         return parts
 
-    def _follower(
-        self, key: NestedKey, event: torch.Size | None, action: NestedKey | None
-    ) -> Representation | None:
-        """Representation of an entry that is not declared; None if copies share it."""
+    def _follower(self, key: NestedKey, event: torch.Size | None, action: NestedKey | None) -> Part | None:
+        """What an entry that is not declared is mapped with, and how; None if copies share it."""
         bare = without_next(key)
         if action is None and is_bookkeeping(bare):
             return None
         if event is None:  # no tensor: a text, an object
             raise _Unknown
-        if (bare, event) not in self._followers:
-            self._followers[bare, event] = self._find_follower(bare, event, action)
-        return self._followers[bare, event]
+        if (bare, event, action) not in self._followers:
+            self._followers[bare, event, action] = self._find_follower(bare, event, action)
+        return self._followers[bare, event, action]
 
-    def _find_follower(
-        self, bare: NestedKey, event: torch.Size, action: NestedKey | None
-    ) -> Representation | None:
+    def _find_follower(self, bare: NestedKey, event: torch.Size, action: NestedKey | None) -> Part | None:
         parent, leaf = split(bare)
         beside = join(parent, "action")
-        if beside in self.position and leaf in (*_SIGNED, *_UNSIGNED):
+        output = beside in self.position and leaf in (*_SIGNED, *_UNSIGNED)
+        if not output and action is None and not is_per_row(bare):
+            raise _Unknown
+
+        exchanged = self._exchanged(bare)
+        if exchanged is not None:
+            names, representation = exchanged
+            representation = _by_key(bare, len(names), representation)
+            whole = event == torch.Size(representation.event_shape[1:])
+            if output and not whole:
+                raise _Unknown
+            signed = output and leaf in _SIGNED
+            return names, representation if signed else _places(bare, representation, event, keys=1)
+
+        if output:
             representation = self.parts[self.position[beside]][1]
             if event != torch.Size(representation.event_shape):
                 raise _Unknown
-            return representation if leaf in _SIGNED else _places(bare, representation, event)
-
-        if action is None and not is_per_row(bare):
-            raise _Unknown
+            return [bare], representation if leaf in _SIGNED else _places(bare, representation, event)
         if event in (torch.Size([]), torch.Size([1])):
             return None  # one number per row
         named = [join(parent, leaf.removesuffix("_log_prob")), beside, *self._only_action()]
         for candidate in [action] if action is not None else named:
             if candidate in self.position:
-                return _places(bare, self.parts[self.position[candidate]][1], event)
+                return [bare], _places(bare, self.parts[self.position[candidate]][1], event)
         raise _Unknown
+
+    def _exchanged(self, bare: NestedKey) -> Part | None:
+        """Entries that change places because those change places that they belong to.
+
+        What belongs to an action by its name, or is in a group that has it: with the left and the right
+        hand's action, ``left_log_prob`` or ``("left", "reward")`` become those of the right one.
+        """
+        path = (*split(bare)[0], split(bare)[1])
+        together = [part for part in self.parts if len(part[0]) > 1]
+        for names, representation in sorted(together, key=lambda part: split(part[0][0])[1] != "action"):
+            paths = [(*split(name)[0], split(name)[1]) for name in names]
+            scores = [(*parts[:-1], f"{parts[-1]}_log_prob") for parts in paths]
+            if path in scores and len(set(scores)) == len(scores):
+                return [unravel_key(other) for other in scores], representation
+            depth = next(k for k in range(1, 1 + max(map(len, paths))) if _distinct_at(paths, k))
+            groups = [parts[:depth] for parts in paths]
+            if path[:depth] in groups:
+                return [unravel_key((*group, *path[depth:])) for group in groups], representation
+        return None
 
     def _only_action(self) -> list[NestedKey]:
         found = [key for key in self.position if split(key)[1] == "action"]
@@ -205,19 +241,53 @@ def require_even(batch: TensorDictBase) -> None:
         )
 
 
-def _places(bare: NestedKey, action: Representation, event: torch.Size) -> Representation:
+def _as_spelled(key: NestedKey, names: list[NestedKey]) -> list[NestedKey]:
+    """Names now, or under ``"next"`` as the key is."""
+    if unravel_key(key) == without_next(key):
+        return names
+    return [join(("next", *split(name)[0]), split(name)[1]) for name in names]
+
+
+def _distinct_at(paths: list[tuple[str, ...]], depth: int) -> bool:
+    return len({path[:depth] for path in paths}) == len(paths)
+
+
+def _by_key(bare: NestedKey, count: int, representation: Representation) -> Representation:
+    """The representation of entries that change places, with one item for each key.
+
+    Raises:
+        KeyError: the entries, which are declared by their sum, are of different sizes.
+    """
+    if len(representation.event_shape) > 1:
+        return representation
+    if representation.dim % count:
+        raise KeyError(
+            f"the batch has {bare!r}, which belongs to one of several entries that are declared together, "
+            "but are not items of one size: nothing tells whether it changes places with those of the "
+            "others; declare it, or drop it with select=..."
+        )
+    return representation.unflatten((count, representation.dim // count))
+
+
+def _places(bare: NestedKey, action: Representation, event: torch.Size, *, keys: int = 0) -> Representation:
     """How the components of an action, or its items, change places: for one value of each.
+
+    Args:
+        bare: the entry.
+        action: representation of the action.
+        event: shape of the entry's values.
+        keys: 1 if the first dimension of the action's events is that of its keys.
 
     Raises:
         _Unknown: the shape is that of no components or items of the action.
         KeyError: the action mixes its components.
     """
-    shape = torch.Size(action.event_shape)
+    shape = torch.Size(action.event_shape[keys:])
     items = event if event == shape[: len(event)] else event[:-1]
-    if not items or items != shape[: len(items)] or event[len(items) :] not in ((), (1,)):
+    if not (items or keys) or items != shape[: len(items)] or event[len(items) :] not in ((), (1,)):
         raise _Unknown
     try:
-        return action.leading(len(items)).unflatten(event)
+        return action.leading(keys + len(items)).unflatten((*action.event_shape[:keys], *event))
     except ValueError as error:
         raise KeyError(
             f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
@@ -248,6 +318,8 @@ def check_events(names: list[NestedKey], events: list[torch.Size], representatio
         wanted = f"{tuple(shape)}"
     elif len(shape) > 1:
         fits, wanted = events == [shape[1:]] * shape[0], f"{shape[0]} of {tuple(shape[1:])}"
+    elif all(event == () for event in events):  # one number for each key
+        fits, wanted = len(events) == shape[0], f"{shape[0]} numbers"
     else:
         fits = (
             all(len(event) == 1 for event in events) and sum(event.numel() for event in events) == shape[0]

@@ -89,8 +89,7 @@ class Symmetry(nn.Module):
         """Keys, and those that they change places with."""
         found: dict[NestedKey, None] = {}
         for key in keys:
-            part = self._declaration.part(key)
-            found |= dict.fromkeys([key] if part is None or len(part[0]) == 1 else part[0])
+            found |= dict.fromkeys(self._declaration.together(key))
         return list(found)
 
     def __contains__(self, key: NestedKey) -> bool:
@@ -286,7 +285,7 @@ class Symmetry(nn.Module):
                 yield names[0], act(representation, values[0])
                 continue
             dims = len(representation.event_shape)
-            if dims > 1:  # one item per key
+            if dims > 1 or values[0].ndim == tensordict.batch_dims:  # one item per key
                 images = act(representation, torch.stack(values, tensordict.batch_dims)).unbind(-dims)
             else:
                 sizes = [value.shape[-1] for value in values]
