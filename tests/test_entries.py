@@ -302,5 +302,18 @@ def test_groups_of_different_sizes_have_no_place_for_what_is_in_them():
     symmetry = Symmetry(GROUP, {Exchanged(("left", "action"), ("right", "action")): ARM + SIGN})
     td = TensorDict({("left", "action"): torch.ones(1, 2), ("right", "action"): torch.ones(1, 1)}, [1])
     td["left", "reward"], td["right", "reward"] = torch.tensor([1.0]), torch.tensor([2.0])
-    with pytest.raises(KeyError, match="not items of one size"):
+    with pytest.raises(KeyError, match="does not know"):
         symmetry(td, 1)
+
+
+def test_how_components_change_places_is_known_before_a_graph_is_traced():
+    symmetry = Symmetry(GROUP, {"observation": SIGN, "action": JOINTS})
+    td = batch(action_log_prob=(3,))
+    traced = torch.compile(symmetry.orbit, fullgraph=True, backend="eager")(td)
+    assert torch.equal(traced[1]["action_log_prob"], td["action_log_prob"].flip(1))
+
+
+def test_lazy_stacks_of_agents_are_augmented():
+    td = agents()
+    image = SymmetryAugment(AGENTS)(LazyStackedTensorDict(*td.unbind(0)))
+    assert torch.equal(image["agents", "action"], SymmetryAugment(AGENTS)(td)["agents", "action"])

@@ -137,6 +137,12 @@ def test_an_event_may_be_a_single_number():
     assert rate(torch.tensor([1.0, 2.0]), torch.tensor([0, 1])).tolist() == [1, -2]
 
 
+def test_elements_of_rows_under_vmap():
+    x, element = random(4, 2, 3), torch.tensor([0, 1, 1, 0])
+    arms = items(HANDS, polar(MIRROR))
+    assert torch.equal(torch.vmap(arms)(x, element), arms(x, element))
+
+
 def test_wrong_shapes_are_refused():
     arms = items(HANDS, polar(MIRROR))
     for x in (torch.zeros(6), torch.zeros(3, 2), torch.zeros(5, 6), torch.zeros(())):

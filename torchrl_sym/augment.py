@@ -16,7 +16,7 @@ from typing import Any, Literal, cast
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from tensordict.utils import expand_as_right
+from tensordict.utils import expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.envs.transforms import Transform
 
@@ -205,7 +205,8 @@ class SymmetryAugment(Transform):
             raise RuntimeError(
                 "a recurrent network reads this flat batch in order (it has is_init or a recurrent state), "
                 f"and elements='random' must not change within a sequence; keep {TRAJECTORY}, reshape the "
-                "batch to [B, T], or sample from a SymmetryReplayBuffer, which knows its slices"
+                "batch to [B, T], sample from a SymmetryReplayBuffer, which knows its slices, or leave "
+                "is_init out with select=[...] if no network has memory"
             )
         return drawn
 
@@ -225,7 +226,7 @@ def check_declared(
     symmetry: Symmetry, td: TensorDictBase, select: Sequence[NestedKey] | None = None
 ) -> None:
     """KeyError if a batch lacks an entry that a strict symmetry declares (of those selected)."""
-    present = td.keys(include_nested=True, leaves_only=True)
+    present = {unravel_key(key) for key in td.keys(True, True)}  # keys of a lazy stack find no nested ones
     declared = symmetry.keys()
     wanted = declared if select is None else [key for key in declared if key in select]
     missing = [key for key in wanted if key not in present]

@@ -66,6 +66,12 @@ class Declaration:
                 spelling[key] = declared
                 self.position[key] = len(self.parts) - 1
         self._check_sides(group)
+        # found here, since nobody can look at how components move while a graph is traced
+        self._by_key = [_by_key(*part) for part in self.parts]
+        self._places = [
+            _places(each, int(len(names) > 1))
+            for each, (names, _) in zip(self._by_key, self.parts, strict=True)
+        ]
         self._followers: dict[tuple[NestedKey, torch.Size, NestedKey | None], Part | None] = {}
 
     @property
@@ -164,44 +170,63 @@ class Declaration:
 
         exchanged = self._exchanged(bare)
         if exchanged is not None:
-            names, representation = exchanged
-            representation = _by_key(bare, len(names), representation)
-            whole = event == torch.Size(representation.event_shape[1:])
-            if output and not whole:
+            names, position = exchanged
+            representation = self._by_key[position]
+            if output and event != torch.Size(representation.event_shape[1:]):
                 raise _Unknown
             signed = output and leaf in _SIGNED
-            return names, representation if signed else _places(bare, representation, event, keys=1)
+            return names, representation if signed else self._follow(bare, position, event)
 
         if output:
-            representation = self.parts[self.position[beside]][1]
+            position = self.position[beside]
+            representation = self.parts[position][1]
             if event != torch.Size(representation.event_shape):
                 raise _Unknown
-            return [bare], representation if leaf in _SIGNED else _places(bare, representation, event)
+            return [bare], representation if leaf in _SIGNED else self._follow(bare, position, event)
         if event in (torch.Size([]), torch.Size([1])):
             return None  # one number per row
         named = [join(parent, leaf.removesuffix("_log_prob")), beside, *self._only_action()]
         for candidate in [action] if action is not None else named:
             if candidate in self.position:
-                return [bare], _places(bare, self.parts[self.position[candidate]][1], event)
+                return [bare], self._follow(bare, self.position[candidate], event)
         raise _Unknown
 
-    def _exchanged(self, bare: NestedKey) -> Part | None:
+    def _follow(self, bare: NestedKey, position: int, event: torch.Size) -> Representation:
+        """How one value for each component or item of an action changes place with it.
+
+        Raises:
+            _Unknown: the shape is that of no components or items of the action.
+            KeyError: the action mixes its components.
+        """
+        found = self._places[position].get(event)
+        if found is None:
+            raise _Unknown
+        if isinstance(found, Representation):
+            return found
+        raise KeyError(
+            f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
+            "the action's representation mixes components, which carries no such value to another; use a "
+            "distribution with one log-probability per action (IndependentNormal), drop the entry with "
+            "select=..., or declare it with invariant(group, d) if all its components are equal"
+        ) from found
+
+    def _exchanged(self, bare: NestedKey) -> tuple[list[NestedKey], int] | None:
         """Entries that change places because those change places that they belong to.
 
         What belongs to an action by its name, or is in a group that has it: with the left and the right
         hand's action, ``left_log_prob`` or ``("left", "reward")`` become those of the right one.
         """
         path = (*split(bare)[0], split(bare)[1])
-        together = [part for part in self.parts if len(part[0]) > 1]
-        for names, representation in sorted(together, key=lambda part: split(part[0][0])[1] != "action"):
-            paths = [(*split(name)[0], split(name)[1]) for name in names]
+        together = [position for position, (names, _) in enumerate(self.parts) if len(names) > 1]
+        for position in sorted(together, key=lambda p: split(self.parts[p][0][0])[1] != "action"):
+            paths = [(*split(name)[0], split(name)[1]) for name in self.parts[position][0]]
             scores = [(*parts[:-1], f"{parts[-1]}_log_prob") for parts in paths]
-            if path in scores and len(set(scores)) == len(scores):
-                return [unravel_key(other) for other in scores], representation
+            if path in scores:
+                return [unravel_key(other) for other in scores], position
             depth = next(k for k in range(1, 1 + max(map(len, paths))) if _distinct_at(paths, k))
             groups = [parts[:depth] for parts in paths]
             if path[:depth] in groups:
-                return [unravel_key((*group, *path[depth:])) for group in groups], representation
+                return [unravel_key((*group, *path[depth:])) for group in groups], position
         return None
 
     def _only_action(self) -> list[NestedKey]:
@@ -252,49 +277,35 @@ def _distinct_at(paths: list[tuple[str, ...]], depth: int) -> bool:
     return len({path[:depth] for path in paths}) == len(paths)
 
 
-def _by_key(bare: NestedKey, count: int, representation: Representation) -> Representation:
-    """The representation of entries that change places, with one item for each key.
-
-    Raises:
-        KeyError: the entries, which are declared by their sum, are of different sizes.
-    """
-    if len(representation.event_shape) > 1:
+def _by_key(names: list[NestedKey], representation: Representation) -> Representation:
+    """The representation with an item for each of several keys, if they are declared by their sum."""
+    count = len(names)
+    if count == 1 or len(representation.event_shape) > 1 or representation.dim % count:
         return representation
-    if representation.dim % count:
-        raise KeyError(
-            f"the batch has {bare!r}, which belongs to one of several entries that are declared together, "
-            "but are not items of one size: nothing tells whether it changes places with those of the "
-            "others; declare it, or drop it with select=..."
-        )
     return representation.unflatten((count, representation.dim // count))
 
 
-def _places(bare: NestedKey, action: Representation, event: torch.Size, *, keys: int = 0) -> Representation:
-    """How the components of an action, or its items, change places: for one value of each.
+def _places(action: Representation, keys: int) -> dict[torch.Size, Representation | ValueError]:
+    """How components of an action, or its items, change places: for one value of each, by its shape.
 
     Args:
-        bare: the entry.
         action: representation of the action.
-        event: shape of the entry's values.
         keys: 1 if the first dimension of the action's events is that of its keys.
-
-    Raises:
-        _Unknown: the shape is that of no components or items of the action.
-        KeyError: the action mixes its components.
     """
-    shape = torch.Size(action.event_shape[keys:])
-    items = event if event == shape[: len(event)] else event[:-1]
-    if not (items or keys) or items != shape[: len(items)] or event[len(items) :] not in ((), (1,)):
-        raise _Unknown
-    try:
-        return action.leading(keys + len(items)).unflatten((*action.event_shape[:keys], *event))
-    except ValueError as error:
-        raise KeyError(
-            f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
-            "the action's representation mixes components, which carries no such value to another; use a "
-            "distribution with one log-probability per action (IndependentNormal), drop the entry with "
-            "select=..., or declare it with invariant(group, d) if all its components are equal"
-        ) from error
+    shape = action.event_shape
+    found: dict[torch.Size, Representation | ValueError] = {}
+    for k in range(1, len(shape) + 1) if len(shape) > keys else ():
+        try:
+            places = action.leading(k)
+        except ValueError as error:
+            places = error
+        for event in (torch.Size(shape[keys:k]), torch.Size((*shape[keys:k], 1))):
+            image = places
+            if isinstance(places, Representation):
+                image = places.unflatten((*shape[:keys], *event))
+            if event not in found or len(event) == k - keys:
+                found[event] = image
+    return found
 
 
 def _check_events(batch: TensorDictBase, names: list[NestedKey], representation: Representation) -> None:

@@ -180,11 +180,12 @@ class Representation(nn.Module):
             )
         # values are looked at where that costs nothing: not on a GPU, nor in a graph that is being traced
         if type(g) is Tensor and g.device.type == "cpu" and not torch.compiler.is_compiling() and g.numel():
-            low, high = g.aminmax()
+            try:
+                low, high = (int(end) for end in g.aminmax())
+            except RuntimeError:  # nor under vmap
+                return
             if low < 0 or high >= self.group.order:
-                raise KeyError(
-                    f"expected element indices in [0, {self.group.order}), got {int(low)} to {int(high)}"
-                )
+                raise KeyError(f"expected element indices in [0, {self.group.order}), got {low} to {high}")
 
     def __add__(self, other: Representation) -> Representation:
         if not isinstance(other, Representation):
