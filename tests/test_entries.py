@@ -70,6 +70,11 @@ def test_numbers_of_no_entry_of_the_action_are_refused(name):
         SYMMETRY(batch(**{name: (7,)}), 1)
 
 
+def test_private_numbers_are_not_taken_for_those_of_the_action():
+    with pytest.raises(KeyError, match=r"'_joint_velocity'.*does not know"):
+        SYMMETRY(batch(_joint_velocity=(3,)), 1)
+
+
 def test_one_number_per_entry_of_an_action_that_mixes_them_is_refused():
     group = PointGroup.rotation(3)
     td = batch(action=(2,), action_log_prob=(2,), observation=(1,))

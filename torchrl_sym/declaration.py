@@ -185,6 +185,8 @@ class Declaration:
             return [bare], representation if leaf in _SIGNED else self._follow(bare, position, event)
         if event in (torch.Size([]), torch.Size([1])):
             return None  # one number per row
+        if action is None and leaf.startswith("_"):
+            raise _Unknown  # private numbers of the action's size may well change sign
         named = [join(parent, leaf.removesuffix("_log_prob")), beside, *self._only_action()]
         for candidate in [action] if action is not None else named:
             if candidate in self.position:
