@@ -268,9 +268,8 @@ def test_bfloat16_products_change_updates_a_little(augmentation):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("augmentation", ["none", "all"])
-def test_compiled_losses_have_the_same_gradients(augmentation):
-    config = dataclasses.replace(TINY, augmentation=augmentation, epochs=1, minibatches=1)
+def test_compiled_losses_have_the_same_gradients():
+    config = dataclasses.replace(TINY, epochs=1, minibatches=1)
     gradients = []
     for compile_ in (False, True):
         learner, data = make_learner(dataclasses.replace(config, compile=compile_))
