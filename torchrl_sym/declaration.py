@@ -222,8 +222,8 @@ def _places(bare: NestedKey, action: Representation, event: torch.Size) -> Repre
         raise KeyError(
             f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
             "the action's representation mixes components, which carries no such value to another; use a "
-            "distribution with one log-probability per action (IndependentNormal), exclude the entry from the "
-            "batch, or declare it with invariant(group, d) if all its components are equal"
+            "distribution with one log-probability per action (IndependentNormal), exclude the entry "
+            "from the batch, or declare it with invariant(group, d) if all its components are equal"
         ) from error
 
 
