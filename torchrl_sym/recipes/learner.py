@@ -70,7 +70,8 @@ class Learner:
             The mean of every loss and diagnostic over the updates, and the learning rate at the end.
 
         Raises:
-            FloatingPointError: a loss or its gradient is not finite; the parameters are those before it.
+            FloatingPointError: a loss or its gradient is not finite; on the CPU, the parameters are those
+                before it, elsewhere it is noticed at the end of the iteration.
         """
         return self.fit(self.estimate(data))
 
