@@ -9,6 +9,7 @@ identity, scattered over the batch. Padded rows of a sequence count nowhere.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 
 import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
@@ -52,7 +53,9 @@ class Copies:
             originals = originals.contiguous()  # TorchRL's losses read no log-probability from lazy stacks
         self.td = originals
         self.mask_keys = list(mask_keys)
-        if elements is None:
+        if elements == [0]:  # there is nothing to copy
+            self.count, self.element, self.expanded = 1, None, originals
+        elif elements is None:
             self.count = symmetry.group.order
             self.element = memory.draw(symmetry, originals)
             copies = symmetry.per_row(originals, self.element, keys=keys, followers=followers)
@@ -68,7 +71,7 @@ class Copies:
 
         Drawn rows are all there, weighted by whether they drew the identity.
         """
-        own = self._weight()
+        own = self._weight
         if self.element is None or own is None:
             return x[: len(x) // self.count]
         own, valid = own[0], self.valid
@@ -96,22 +99,24 @@ class Copies:
         counted = valid.reshape(valid.shape + (1,) * (x.ndim - valid.ndim)).expand_as(x)
         return torch.where(counted, x, 0).sum() / counted.sum().clamp_min(1)
 
-    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
+    def report(self, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> dict[str, Tensor]:
         """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
+        out = {}
         for name, value in (("kl_approx", kl.detach()), ("clip_fraction", clipped)):
-            means = self.means(value)
-            td_out.set(name, means[0])
-            td_out.set(f"{name}_sym", means)
+            out[f"{name}_sym"] = self.means(value)
+            out[name] = out[f"{name}_sym"][0]
         log_ratio = log_ratio.detach().squeeze(-1)
-        td_out.set("mean_ratio", self.mean(log_ratio.exp()))
+        out["mean_ratio"] = self.mean(log_ratio.exp())
 
         values, weight = self._table(log_ratio)
         if weight is not None:
             values = values.masked_fill(weight == 0, -torch.inf)
-        td_out.set("max_ratio", values[0].max().exp())
+        out["max_ratio"] = values[0].max().exp()
         own, counted = (None, None) if weight is None else (weight[0], weight.flatten(1))
-        td_out.set("ESS", _effective_share(values[0], own, 0))
-        td_out.set("ESS_sym", _effective_share(values.flatten(1), counted, 1))
+        out["ESS_sym"] = _effective_share(values.flatten(1), counted, 1)
+        # over the first dimension, as ClipPPOLoss takes it: of every step of sequences, of every agent
+        out["ESS"] = out["ESS_sym"][0] if values.ndim == 2 else _effective_share(values[0], own, 0)
+        return out
 
     def _table(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         """Values of every element's rows, ``(N, B, ...)``, and whether each counts; None if all do."""
@@ -119,11 +124,12 @@ class Copies:
             values = x.unflatten(0, (self.count, -1))
         else:
             values = x.expand(self.count, *x.shape)
-        weight = self._weight()
+        weight = self._weight
         if weight is not None:
             weight = weight.reshape(weight.shape + (1,) * (values.ndim - weight.ndim)).expand_as(values)
         return values, weight
 
+    @cached_property
     def _weight(self) -> Tensor | None:
         """1 where a row is one of an element's and no padding, ``(N, B, ...)``; None if all are."""
         valid = self.valid
@@ -135,7 +141,7 @@ class Copies:
             counted = counted if valid is None else counted & valid
         return None if counted is None else counted.to(torch.get_default_dtype())
 
-    @property
+    @cached_property
     def valid(self) -> Tensor | None:
         """Which of the rows to evaluate are no padding, ``[N * B, ...]``; None if all are."""
         valid = None
