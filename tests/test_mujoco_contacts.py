@@ -142,7 +142,8 @@ FILTERS = {
 @pytest.mark.parametrize(("flag", "more"), FILTERS.values(), ids=FILTERS)
 def test_geoms_that_may_collide_are_those_that_do_when_all_overlap(flag, more):
     model = mujoco.MjModel.from_xml_string(f"""<mujoco><option>{flag}</option>
-      <default><geom size=".1"/></default><worldbody><geom name="floor" type="plane" size="1 1 1"/><geom name="rock"/>
+      <default><geom size=".1"/></default>
+      <worldbody><geom name="floor" type="plane" size="1 1 1"/><geom name="rock"/>
         <body mocap="true"><geom name="hand"/></body>
         <body name="base"><freejoint/><geom name="base"/><geom name="ghost" contype="0" conaffinity="0"/>
           <body><geom name="welded"/></body>
