@@ -6,10 +6,12 @@ import textwrap
 
 import pytest
 import torch
+from dm_control import suite
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import Transition
 from torchrl.envs import RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from tasks import make_env
 from torchrl_sym import (
@@ -19,7 +21,13 @@ from torchrl_sym import (
     SymmetryAugment,
     SymmetryReplayBuffer,
 )
-from torchrl_sym._torchrl import INHERITED, buffers_sampling_by, cuts_by, serial_workers
+from torchrl_sym._torchrl import (
+    INHERITED,
+    buffers_sampling_by,
+    cuts_by,
+    serial_workers,
+    wrapped_env,
+)
 
 
 @pytest.mark.parametrize("parent", INHERITED, ids=lambda parent: parent.__name__)
@@ -111,3 +119,10 @@ def test_the_inverse_of_a_transform_in_a_buffer_is_its_inverse_call():
         buffer = kind(storage=LazyTensorStorage(8), transform=Spy())
         buffer.extend(TensorDict(episode=torch.zeros(8), batch_size=[8]))
         assert "seen" in buffer[:].keys()  # noqa: SIM118
+
+
+def test_what_a_wrapper_of_another_library_wraps():
+    inner = suite.load("cartpole", "swingup")
+    assert wrapped_env(DMControlWrapper(inner)) is inner
+    own = make_env("cartpole", num_envs=2, num_threads=1)
+    assert wrapped_env(own) is own

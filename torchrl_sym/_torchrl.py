@@ -3,10 +3,13 @@
 TorchRL may change them in any release; ``tests/test_torchrl_contracts.py`` says what we expect of each.
 """
 
+from typing import Any
+
 from tensordict import NestedKey
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
 from torchrl.envs import EnvBase, SerialEnv, Transform, VecNormV2
+from torchrl.envs.common import _EnvWrapper
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
@@ -22,6 +25,7 @@ __all__ = [
     "check_advantage_broadcast",
     "cuts_by",
     "serial_workers",
+    "wrapped_env",
 ]
 
 # What our subclasses take from their parents or put in their place, by parent, with its arguments.
@@ -72,3 +76,8 @@ def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer
 def cuts_by(sampler: SliceSampler, key: NestedKey) -> bool:
     """Whether a sampler takes slices between changes of this entry, wherever the storage has it."""
     return sampler.traj_key == key or getattr(sampler, "_traj_key_auto", False)
+
+
+def wrapped_env(env: EnvBase) -> Any:
+    """What a GymEnv, a DMControlEnv, ... wraps; the environment itself if it is TorchRL's own."""
+    return env._env if isinstance(env, _EnvWrapper) else env
