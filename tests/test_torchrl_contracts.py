@@ -10,7 +10,7 @@ from dm_control import suite
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import Transition
-from torchrl.envs import RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from tasks import make_env
@@ -27,6 +27,7 @@ from torchrl_sym._torchrl import (
     cuts_by,
     serial_workers,
     wrapped_env,
+    wrappers_of,
 )
 
 
@@ -126,3 +127,11 @@ def test_what_a_wrapper_of_another_library_wraps():
     assert wrapped_env(DMControlWrapper(inner)) is inner
     own = make_env("cartpole", num_envs=2, num_threads=1)
     assert wrapped_env(own) is own
+
+
+def test_gymnasium_wrappers_are_inside_the_environment():
+    gym = pytest.importorskip("gymnasium")
+    inner = gym.make("CartPole-v1")
+    outer = gym.wrappers.NormalizeObservation(inner)
+    assert wrappers_of(GymWrapper(outer))[:2] == [outer, inner]
+    assert wrappers_of(make_env("cartpole", num_envs=1, num_threads=1)) == []

@@ -26,6 +26,7 @@ __all__ = [
     "cuts_by",
     "serial_workers",
     "wrapped_env",
+    "wrappers_of",
 ]
 
 # What our subclasses take from their parents or put in their place, by parent, with its arguments.
@@ -66,6 +67,15 @@ def serial_workers(env: SerialEnv) -> list[EnvBase]:
         env.start()
     makers = [id(maker) for maker in env.create_env_fn]
     return list(dict(zip(makers, env._envs, strict=True)).values())
+
+
+def wrappers_of(env: EnvBase) -> list[object]:
+    """What another library has put around the simulation inside an environment, the outermost first."""
+    found, inner = [], vars(env).get("_env")  # batched environments would ask their workers
+    while inner is not None and inner not in found:
+        found.append(inner)
+        inner = getattr(inner, "env", None)
+    return found
 
 
 def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer]:
