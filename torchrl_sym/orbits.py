@@ -9,7 +9,6 @@ identity, scattered over the batch. Padded rows of a sequence count nowhere.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
 
 import torch
 from tensordict import LazyStackedTensorDict, NestedKey, TensorDictBase
@@ -36,6 +35,7 @@ class Copies:
         expanded: the rows to evaluate, ``[N * B, ...]``, or ``[B, ...]`` if drawn.
         element: the drawn elements, ``[B, ...]``; None with all of them.
         count: number of elements N.
+        valid: which of the rows to evaluate are no padding; None if all are.
     """
 
     def __init__(
@@ -52,7 +52,6 @@ class Copies:
         if isinstance(originals, LazyStackedTensorDict):
             originals = originals.contiguous()  # TorchRL's losses read no log-probability from lazy stacks
         self.td = originals
-        self.mask_keys = list(mask_keys)
         if elements == [0]:  # there is nothing to copy
             self.count, self.element, self.expanded = 1, None, originals
         elif elements is None:
@@ -65,6 +64,8 @@ class Copies:
             self.element = None
             orbit = symmetry.orbit(originals, elements, keys=keys, followers=followers)
             self.expanded = memory.rebuild(orbit).reshape(-1, *originals.batch_size[1:])
+        self.valid = valid_rows(self.expanded, mask_keys)
+        self._weight = self._counted()
 
     def originals(self, x):
         """Rows of the identity, of a tensor or tensordict: such that their mean is theirs.
@@ -129,28 +130,26 @@ class Copies:
             weight = weight.reshape(weight.shape + (1,) * (values.ndim - weight.ndim)).expand_as(values)
         return values, weight
 
-    @cached_property
-    def _weight(self) -> Tensor | None:
+    def _counted(self) -> Tensor | None:
         """1 where a row is one of an element's and no padding, ``(N, B, ...)``; None if all are."""
-        valid = self.valid
         if self.element is None:
-            counted = None if valid is None else valid.unflatten(0, (self.count, -1))
+            counted = None if self.valid is None else self.valid.unflatten(0, (self.count, -1))
         else:
             index = torch.arange(self.count, device=self.element.device)
             counted = self.element == index.reshape(-1, *[1] * self.element.ndim)
-            counted = counted if valid is None else counted & valid
+            counted = counted if self.valid is None else counted & self.valid
         return None if counted is None else counted.to(torch.get_default_dtype())
 
-    @cached_property
-    def valid(self) -> Tensor | None:
-        """Which of the rows to evaluate are no padding, ``[N * B, ...]``; None if all are."""
-        valid = None
-        for key in self.mask_keys:
-            mask = self.expanded.get(key, None)
-            if mask is not None:
-                mask = mask.reshape(self.expanded.batch_size)
-                valid = mask if valid is None else valid & mask
-        return valid
+
+def valid_rows(td: TensorDictBase, mask_keys: Iterable[NestedKey]) -> Tensor | None:
+    """Which rows are no padding; None if all are."""
+    valid = None
+    for key in mask_keys:
+        mask = td.get(key, None)
+        if mask is not None:
+            mask = mask.reshape(td.batch_size)
+            valid = mask if valid is None else valid & mask
+    return valid
 
 
 def variance(x: Tensor, valid: Tensor | None) -> Tensor:
