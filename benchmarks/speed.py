@@ -72,13 +72,14 @@ class Arguments:
 
 def markdown(results: dict) -> str:
     """All tables, for people; the JSON file has the same figures for programs."""
-    versions = ", ".join(f"{name} {version}" for name, version in results["versions"].items())
-    text = f"Made by `python benchmarks/speed.py` on {results['machine']['processor']}; {versions}.\n"
-    for name in TABLES:
-        if name in results:
-            keys = list(results[name][0])
-            lines = [keys, ["---:"] * len(keys), *([cell(row[k]) for k in keys] for row in results[name])]
-            text += f"\n## {name}\n\n" + "".join(f"| {' | '.join(line)} |\n" for line in lines)
+    text = "Made by `python benchmarks/speed.py`.\n"
+    for name in (name for name in TABLES if name in results):
+        made = results["made"][name]
+        versions = ", ".join(f"{package} {version}" for package, version in made["versions"].items())
+        keys = list(results[name][0])
+        lines = [keys, ["---:"] * len(keys), *([cell(row[k]) for k in keys] for row in results[name])]
+        text += f"\n## {name}\n\n{made['processor']}; {versions}.\n\n"
+        text += "".join(f"| {' | '.join(line)} |\n" for line in lines)
     return text
 
 
@@ -354,17 +355,21 @@ def main(arguments: Arguments) -> None:
         for name, measure in TABLES.items()
         if name == arguments.only or (arguments.only is None and name != "options")
     }
-    results["versions"] = {
-        "python": platform.python_version(),
-        **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
-        "rsl_rl": version("rsl-rl-lib") if INSTALLED else "not installed",
+    made = {
+        "processor": processor(),
+        "physics_threads": arguments.threads,
+        "versions": {
+            "python": platform.python_version(),
+            **{module.__name__: module.__version__ for module in (torch, torchrl, tensordict, mujoco)},
+            "rsl_rl": version("rsl-rl-lib") if INSTALLED else "not installed",
+        },
     }
-    results["machine"] = {"processor": processor(), "physics_threads": arguments.threads}
     if arguments.output is not None:
         kept = json.loads(arguments.output.read_text()) if arguments.output.exists() else {}
+        results = kept | results | {"made": kept.get("made", {}) | dict.fromkeys(results, made)}
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(json.dumps(kept | results, indent=2) + "\n")
-        arguments.output.with_suffix(".md").write_text(markdown(kept | results))
+        arguments.output.write_text(json.dumps(results, indent=2) + "\n")
+        arguments.output.with_suffix(".md").write_text(markdown(results))
         print(f"\nwritten to {arguments.output} and {arguments.output.with_suffix('.md')}")
 
 

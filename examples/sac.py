@@ -71,11 +71,12 @@ buffer = SymmetryReplayBuffer(symmetry, elements="random", storage=LazyTensorSto
 collector = Collector(
     env, actor, frames_per_batch=EPISODE, total_frames=steps, init_random_frames=min(RANDOM, steps // 2)
 )
-collected = 0
+collected, returns = 0, []
 for data in collector:
     buffer.extend(data)
     collected += len(data)
-    if collected < RANDOM and collected < steps // 2:
+    returns.append(data["next", "episode_reward"][-1].item())
+    if collected < min(RANDOM, steps // 2):
         continue
 
     for _ in range(EPISODE // 2):
@@ -86,10 +87,12 @@ for data in collector:
         optimizer.step()
         target.step()
 
+    if collected % 1000 and collected < steps:
+        continue
     with torch.no_grad():
         seen = data["observation"]
         action, mirrored = (net(x).chunk(2, -1)[0].tanh() for x in (seen, symmetry["observation"](seen, 1)))
     asymmetry = (mirrored - symmetry["action"](action, 1)).square().mean()
-    earned = data["next", "episode_reward"][-1].item()
-    print(f"{collected} steps: return {earned:.1f}, mirror error {asymmetry:.3f}")
+    earned = f"return of the last episodes {np.mean(returns[-8:]):.1f}"
+    print(f"{collected} steps: {earned}, mirror error {asymmetry:.3f}")
 collector.shutdown()

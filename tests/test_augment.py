@@ -2,7 +2,6 @@
 
 import copy
 import pickle
-import shutil
 
 import pytest
 import torch
@@ -240,24 +239,18 @@ def test_the_naive_rule_is_refused_where_it_would_meet_a_later_policy():
 
 # --- torch.compile
 
-compiles = pytest.mark.skipif(
-    shutil.which("g++") is None and shutil.which("clang++") is None,
-    reason="torch.compile needs a C++ compiler",
-)
 
-
-@compiles
 @pytest.mark.parametrize("settings", [{}, {"layout": "stack"}], ids=str)
 def test_compiles_to_one_graph(settings):
     augment, batch = SymmetryAugment(make_symmetry("D3"), **settings), make_batch(8)
-    compiled = torch.compile(augment.forward, fullgraph=True)
+    compiled = torch.compile(augment.forward, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(batch).to_dict(), augment(batch).to_dict())
 
 
-@compiles
 def test_random_elements_compile_to_one_graph():
     symmetry, batch = make_symmetry("K4"), make_batch(64)
-    compiled = torch.compile(SymmetryAugment(symmetry, elements="random").forward, fullgraph=True)
+    augment = SymmetryAugment(symmetry, elements="random")
+    compiled = torch.compile(augment.forward, fullgraph=True, backend="aot_eager")
     assert drawn_elements(compiled(batch), batch, symmetry).unique().tolist() == [0, 1, 2, 3]
 
 

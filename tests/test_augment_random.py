@@ -197,8 +197,26 @@ def test_copies_of_sequences_begin_from_zero_memory_or_are_refused(elements):
         augment(recurrent_batch(8, 3, stored=1.0))
 
 
+@pytest.mark.parametrize("elements", ["all", "random"])
+def test_the_memory_of_next_states_is_not_that_of_the_unmirrored_history(elements):
+    td = recurrent_batch(8, 3, stored=0.0)
+    td["next", "recurrent_state"] = torch.ones(8, 3, 1, 2)
+    assert ("next", "recurrent_state") not in SymmetryAugment(RECURRENT, elements=elements)(td).keys(True)
+    equivariant = Symmetry(
+        GROUP, {"observation": pseudoscalar(GROUP), "recurrent_state": pseudoscalar(GROUP) * 2}
+    )
+    out = SymmetryAugment(equivariant)(td)
+    assert (out["next", "recurrent_state"][8:] == -1).all()
+
+
 def test_flat_slices_with_a_stored_memory_are_refused_by_the_buffer():
     buffer = SymmetryReplayBuffer(RECURRENT, storage=LazyTensorStorage(8), batch_size=4)
     buffer.extend(recurrent_batch(8, 1, stored=1.0)[:, 0])
     with pytest.raises(RuntimeError, match="leave it out of the buffer"):
         buffer.sample()
+
+
+def test_flat_slices_without_their_memory_are_copied():
+    buffer = SymmetryReplayBuffer(RECURRENT, storage=LazyTensorStorage(8), batch_size=4)
+    buffer.extend(recurrent_batch(8, 1, stored=1.0)[:, 0].exclude("recurrent_state"))
+    assert (buffer.sample()["observation"][4:] == -1).all()

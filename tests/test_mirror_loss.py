@@ -3,7 +3,6 @@
 import copy
 import io
 import pickle
-import shutil
 
 import pytest
 import torch
@@ -351,11 +350,10 @@ def test_keeps_the_precision(dtype):
     assert out["loss_mirror"].dtype == out["mirror_error"].dtype == dtype
 
 
-@pytest.mark.skipif(not shutil.which("c++") and not shutil.which("g++"), reason="no C++ compiler")
 def test_compiles_without_graph_breaks():
     actor, batch = make_actor(), make_batch()
     loss = MirrorLoss(actor, symmetry=make_symmetry("K4"))
-    compiled = torch.compile(loss, fullgraph=True)
+    compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
     torch.testing.assert_close(compiled(batch)["loss_mirror"], loss(batch)["loss_mirror"])
     torch.testing.assert_close(gradients(compiled, batch, [actor]), gradients(loss, batch, [actor]))
 

@@ -110,6 +110,23 @@ def test_network_that_is_trained_later():
     train(mirror(actor), optimizer)
 
 
+@pytest.mark.parametrize("every", [0, 4])
+def test_network_that_was_trained_before(every):
+    """Optimizers that set gradients to zero leave high counters; then it is evaluated, or accumulated."""
+    actor, data = make_actor(), make_batch()
+    optimizer = torch.optim.SGD(actor.parameters(), 1e-3)
+    for _ in range(150):
+        actor.get_dist(data).deterministic_sample.sum().backward()
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=False)
+    loss = mirror(actor)
+    if every:
+        train(loss, optimizer, every=every, set_to_none=False)
+    else:
+        for _ in range(STEPS):
+            loss(data)
+
+
 def test_frozen_network_beside_one_that_learns():
     loss, other = mirror(make_actor().requires_grad_(False)), nn.Linear(1, 1)
     for _ in range(STEPS):

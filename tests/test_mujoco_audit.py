@@ -70,7 +70,7 @@ def robot(kind, changes=None, option='cone="elliptic"', more=""):
     return mujoco.MjModel.from_xml_string(f"""<mujoco><compiler angle="radian"/><option {option}/>
       <worldbody><geom name="floor" type="plane" size="1 1 1"/>
         <body name="base" pos="0 0 1"><freejoint name="base"/>
-          <geom name="base" type="cylinder" size=".15 .05" mass="4"/>{tops}{section["leg"]}
+          <geom name="base" type="capsule" size=".15 .05" mass="4"/>{tops}{section["leg"]}
         </body></worldbody>
       <actuator>{section["act"]}</actuator><tendon>{section["tendon"]}</tendon>
       <equality>{section["eq"]}</equality><sensor>{touches}</sensor>{more}</mujoco>""")

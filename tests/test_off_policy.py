@@ -16,8 +16,8 @@ from comparison.intervals import Estimate
 from torchrl_sym.mujoco import verify
 
 ROOT = Path(__file__).parents[1]
-TINY = {"seeds": (0, 1), "frames": 320, "envs": 2, "updates": 1, "rows": 8, "cells": 8}
-TINY |= {"random_frames": 160, "evaluations": 2, "episodes": 1}
+TINY = {"seeds": (0, 1), "frames": 160, "envs": 2, "updates": 1, "rows": 8, "cells": 8}
+TINY |= {"random_frames": 80, "evaluations": 2, "episodes": 1}
 
 
 @pytest.fixture(scope="module")
@@ -95,8 +95,8 @@ def test_arms_start_alike_and_part(runs):
     for algorithm in ("sac", "td3"):
         plain, symmetric = curves[algorithm, "plain"], curves[algorithm, "symmetric"]
         assert list(plain) == list(symmetric) == [0, 1]
-        assert plain[0]["frames"].tolist() == [160, 320]
-        assert plain[0]["updates"].tolist() == [0, 80]
+        assert plain[0]["frames"].tolist() == [80, 160]
+        assert plain[0]["updates"].tolist() == [0, 40]
         for seed in plain:
             assert plain[seed]["return"][0] == symmetric[seed]["return"][0]  # untrained
             assert plain[seed]["return"][1] != symmetric[seed]["return"][1]
@@ -112,7 +112,7 @@ def test_a_finished_run_is_not_repeated_and_page_and_picture_follow(runs, tmp_pa
     assert (tmp_path / "curves.png").stat().st_size > 10_000
     text = " ".join((tmp_path / "page.md").read_text().split())
     assert text.count("| area under the curve of returns |") == 2
-    assert "320 frames of a seed" in text and "80 gradient steps of 8 rows" in text
+    assert "160 frames of a seed" in text and "40 gradient steps of 8 rows" in text
 
 
 class Refusing:

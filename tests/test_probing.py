@@ -165,6 +165,12 @@ RIGHT = {
     "a user's own normaliser": lambda: robot(RunningMean(average=True)),
     "a function": lambda: Robot().append_transform(lambda td: td.set("observation", -td["observation"])),
     "noise": lambda: robot(Plain(noise)),
+    "noise twice": lambda: robot(Plain(noise), norm(0.0, SPREAD), Plain(noise)),
+    "a sign": lambda: robot(Plain(torch.sign)),
+    "a clip that nearly everything exceeds": lambda: robot(
+        ClipTransform(in_keys=["observation"], low=-0.01, high=0.01)
+    ),
+    "a dead zone": lambda: robot(Plain(lambda x: torch.where(x.abs() > 5, x, torch.zeros_like(x)))),
     "frames skipped": lambda: robot(FrameSkipTransform(2), NoopResetEnv(3), batch_size=()),
 }
 
@@ -184,6 +190,14 @@ WRONG = {
     "a function": (
         "Callable",
         lambda: Robot().append_transform(lambda td: td.set("observation", td["observation"] + 1)),
+    ),
+    "between noise": (
+        "ObservationNorm",
+        lambda: robot(Plain(noise), StepCounter(), norm(OFF), RewardSum(), Plain(noise)),
+    ),
+    "running, between noise": (
+        "VecNormV2",
+        lambda: robot(Plain(noise), VecNormV2(["observation"]), Plain(noise)),
     ),
     "behind noise": ("ObservationNorm", lambda: robot(Plain(noise), norm(OFF))),
     "nested": ("ObservationNorm", lambda: robot(StepCounter(), Compose(Compose(norm(OFF))))),

@@ -315,7 +315,7 @@ def test_single_precision_agrees_with_double():
 
 @pytest.mark.skipif(not shutil.which("c++") and not shutil.which("g++"), reason="no C++ compiler")
 def test_compiles_without_graph_breaks():
-    loss, batch = make_loss(clip_value=None), batch_of()  # ClipPPOLoss branches on clip_value
+    loss, batch = make_loss(), batch_of()
     compiled = torch.compile(loss, fullgraph=True)
     assert_same(compiled(batch), loss(batch))
     modules = [loss.actor_network_params, loss.critic_network_params]
@@ -324,7 +324,7 @@ def test_compiles_without_graph_breaks():
 
 @pytest.mark.parametrize("distribution", [IndependentNormal, TanhNormal])
 def test_random_elements_trace_without_graph_breaks(distribution):
-    loss = make_loss(elements="random", distribution=distribution, clip_value=None)
+    loss = make_loss(elements="random", distribution=distribution)
     batch = batch_of(bound=1.9)
     traced = torch.compile(loss, fullgraph=True, backend="aot_eager")
     found, expected = seeded(traced, batch), seeded(loss, batch)

@@ -6,10 +6,12 @@ import textwrap
 
 import pytest
 import torch
+from dm_control import suite
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import Transition
-from torchrl.envs import RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs import GymWrapper, RewardSum, SerialEnv, StepCounter, Transform, TransformedEnv
+from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from tasks import make_env
 from torchrl_sym import (
@@ -19,7 +21,14 @@ from torchrl_sym import (
     SymmetryAugment,
     SymmetryReplayBuffer,
 )
-from torchrl_sym._torchrl import INHERITED, buffers_sampling_by, cuts_by, serial_workers
+from torchrl_sym._torchrl import (
+    INHERITED,
+    buffers_sampling_by,
+    cuts_by,
+    serial_workers,
+    wrapped_env,
+    wrappers_of,
+)
 
 
 @pytest.mark.parametrize("parent", INHERITED, ids=lambda parent: parent.__name__)
@@ -111,3 +120,18 @@ def test_the_inverse_of_a_transform_in_a_buffer_is_its_inverse_call():
         buffer = kind(storage=LazyTensorStorage(8), transform=Spy())
         buffer.extend(TensorDict(episode=torch.zeros(8), batch_size=[8]))
         assert "seen" in buffer[:].keys()  # noqa: SIM118
+
+
+def test_what_a_wrapper_of_another_library_wraps():
+    inner = suite.load("cartpole", "swingup")
+    assert wrapped_env(DMControlWrapper(inner)) is inner
+    own = make_env("cartpole", num_envs=2, num_threads=1)
+    assert wrapped_env(own) is own
+
+
+def test_gymnasium_wrappers_are_inside_the_environment():
+    gym = pytest.importorskip("gymnasium")
+    inner = gym.make("CartPole-v1")
+    outer = gym.wrappers.NormalizeObservation(inner)
+    assert wrappers_of(GymWrapper(outer))[:2] == [outer, inner]
+    assert wrappers_of(make_env("cartpole", num_envs=1, num_threads=1)) == []

@@ -1,8 +1,8 @@
-"""What TorchRL asks of a transform, for SymmetryAugment; and TorchRL's own tests of ClipPPOLoss, for ours.
+"""What TorchRL asks of a transform, for SymmetryAugment; and TorchRL's own tests, for ours.
 
 TorchRL lists the tests that every transform must have in ``TransformBase``, which its tests share. Those of
-``ClipPPOLoss`` are run where the environment variable TORCHRL_CHECKOUT names a checkout of TorchRL:
-:mod:`tests.torchrl_suite` says how, which ones cannot apply, and why.
+``ClipPPOLoss`` and ``VecNormV2`` are run where the environment variable TORCHRL_CHECKOUT names a checkout
+of TorchRL: :mod:`tests.torchrl_suite` says how, which ones cannot apply, and why.
 """
 
 import os
@@ -123,11 +123,11 @@ def test_the_list_of_torchrl_is_complete():
 @with_checkout
 @pytest.mark.slow
 @pytest.mark.parametrize("elements", ["all", "random"])
-def test_clip_ppo_loss_of_torchrl(elements):
+def test_tests_of_torchrl(elements):
     checkout = Path(CHECKOUT).resolve()
     command = [sys.executable, "-m", "pytest", "-q", "--tb=short", "-c", str(checkout / "pytest.ini")]
     command += ["-p", "tests.torchrl_suite", "-p", "no:cacheprovider", "--symmetric", elements]
-    files = [str(checkout / "test/objectives" / name) for name in FILES]
+    files = [str(checkout / "test" / name) for name in FILES]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     ran = subprocess.run(
         [*command, *files],

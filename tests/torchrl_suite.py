@@ -1,7 +1,8 @@
 """TorchRL's own tests, with the classes of this package in the place of those that they stand in for.
 
 A pytest plugin, for a checkout of TorchRL at (or near) the installed version. It runs the tests there of
-``ClipPPOLoss`` on :class:`~torchrl_sym.SymmetricClipPPOLoss`, with all elements or drawn ones::
+``ClipPPOLoss`` on :class:`~torchrl_sym.SymmetricClipPPOLoss`, with all elements or drawn ones, and those of
+``VecNormV2`` on ``SymmetricVecNorm``, with the trivial group, under which both have the same statistics::
 
     git clone --depth 1 --branch v0.14.1 https://github.com/pytorch/rl
     TORCHRL_CHECKOUT=rl python -m pytest tests/test_torchrl_suite.py
@@ -21,14 +22,22 @@ import sys
 
 import pytest
 import torch
+import torchrl.envs
 import torchrl.objectives
 from tensordict import NestedKey
 from torch import nn
 
 from torchrl_sym import PointGroup, SymmetricClipPPOLoss, Symmetry
+from torchrl_sym.normalization import GroupAverage
 from torchrl_sym.representations import Representation, invariant
+from torchrl_sym.vecnorm import SymmetricVecNorm
 
-FILES = ("test_ppo.py", "test_loss_module.py", "test_vla.py")
+FILES = (
+    "objectives/test_ppo.py",
+    "objectives/test_loss_module.py",
+    "objectives/test_vla.py",
+    "transforms/test_normalization.py",
+)
 
 # A test, the elements it cannot pass with, and the property of the method that forbids it.
 EXCLUDED = {
@@ -41,6 +50,17 @@ EXCLUDED = {
     "test_ppo_marl_aggregate": ("all", "counts rows: its policy writes three, whatever it is given"),
     "test_ppo_shared_seq": ("random", "compares two losses, which draw different elements"),
     "test_ppo_ess_preserves_feature_shape": ("any", "its actor is no TensorDictModule, which we ask for"),
+    "test_stateful_and_stateless_specs[False]": (
+        "any",
+        "statistics in the data, which ours does not offer",
+    ),
+    "test_stateful_vs_stateless": ("any", "statistics in the data, which ours does not offer"),
+    "test_vecnorm_stack[False]": ("any", "statistics in the data, which ours does not offer"),
+    "test_denorm[False]": ("any", "statistics in the data, which ours does not offer"),
+    "VecNormV2::test_state_dict_vecnorm": (
+        "any",
+        "reading the state shares it, with workers; a clone's is its own",
+    ),
     "TestTokenPPO": ("any", "its actor reads a text, for which nothing can be declared"),
 }
 
@@ -101,6 +121,18 @@ class StandIn(SymmetricClipPPOLoss):
         super().__init__(actor_network, critic_network, **settings)
 
 
+class NormStandIn(SymmetricVecNorm):
+    """A SymmetricVecNorm that is made as a VecNormV2 is, of entries that no element changes."""
+
+    def __init__(self, in_keys, out_keys=None, *, stateful=True, **settings):
+        assert stateful
+        trivial = PointGroup.trivial()
+        entries = {key: invariant(trivial, 1) for key in ("observation", *in_keys)}
+        super().__init__(in_keys, out_keys, symmetry=Symmetry(trivial, entries), **settings)
+        # whatever their sizes, which nobody tells
+        self.averages = nn.ModuleList(GroupAverage(None) for _ in in_keys)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--symmetric", choices=("all", "random"), default="all", help="elements of the copies")
 
@@ -108,6 +140,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     StandIn.symmetric_elements = config.getoption("--symmetric")
     torchrl.objectives.ClipPPOLoss = StandIn
+    torchrl.envs.VecNormV2 = NormStandIn
 
 
 def pytest_pycollect_makemodule(module_path, parent) -> None:
@@ -118,7 +151,7 @@ def pytest_pycollect_makemodule(module_path, parent) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Keep the tests that make a ClipPPOLoss and that the method can pass."""
+    """Keep the tests that make what we stand in for and that the method can pass."""
     elements = config.getoption("--symmetric")
     excluded = [name for name, (which, _) in EXCLUDED.items() if which in (elements, "any")]
     kept = [i for i in items if _makes_ours(i) and not any(name in i.nodeid for name in excluded)]
@@ -130,4 +163,5 @@ def _makes_ours(item: pytest.Item) -> bool:
     parameters = item.callspec.params if hasattr(item, "callspec") else {}
     if "loss_class" in parameters:
         return parameters["loss_class"] is StandIn
-    return "ClipPPOLoss" in inspect.getsource(item.function) or "TokenPPO" in item.nodeid
+    source = inspect.getsource(item.function)
+    return "ClipPPOLoss" in source or any(name in item.nodeid for name in ("TestVecNormV2", "TokenPPO"))

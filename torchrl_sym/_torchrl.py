@@ -3,10 +3,13 @@
 TorchRL may change them in any release; ``tests/test_torchrl_contracts.py`` says what we expect of each.
 """
 
+from typing import Any
+
 from tensordict import NestedKey
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
 from torchrl.envs import EnvBase, SerialEnv, Transform, VecNormV2
+from torchrl.envs.common import _EnvWrapper
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
@@ -22,6 +25,8 @@ __all__ = [
     "check_advantage_broadcast",
     "cuts_by",
     "serial_workers",
+    "wrapped_env",
+    "wrappers_of",
 ]
 
 # What our subclasses take from their parents or put in their place, by parent, with its arguments.
@@ -64,6 +69,15 @@ def serial_workers(env: SerialEnv) -> list[EnvBase]:
     return list(dict(zip(makers, env._envs, strict=True)).values())
 
 
+def wrappers_of(env: EnvBase) -> list[object]:
+    """What another library has put around the simulation inside an environment, the outermost first."""
+    found, inner = [], vars(env).get("_env")  # batched environments would ask their workers
+    while inner is not None and inner not in found:
+        found.append(inner)
+        inner = getattr(inner, "env", None)
+    return found
+
+
 def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer]:
     """The replay buffers of a storage that have a sample unit."""
     return [buffer for buffer in storage._attached_entities if buffer._sample_unit is unit]
@@ -72,3 +86,8 @@ def buffers_sampling_by(unit: SampleUnit, storage: Storage) -> list[ReplayBuffer
 def cuts_by(sampler: SliceSampler, key: NestedKey) -> bool:
     """Whether a sampler takes slices between changes of this entry, wherever the storage has it."""
     return sampler.traj_key == key or getattr(sampler, "_traj_key_auto", False)
+
+
+def wrapped_env(env: EnvBase) -> Any:
+    """What a GymEnv, a DMControlEnv, ... wraps; the environment itself if it is TorchRL's own."""
+    return env._env if isinstance(env, _EnvWrapper) else env

@@ -225,11 +225,14 @@ class SymmetryAugment(Transform):
 def check_declared(
     symmetry: Symmetry, td: TensorDictBase, select: Sequence[NestedKey] | None = None
 ) -> None:
-    """KeyError if a batch lacks an entry that a strict symmetry declares (of those selected)."""
+    """KeyError if a batch lacks an entry that a strict symmetry declares (of those selected).
+
+    But for memory: where it is left out, networks begin from zero with originals and copies alike.
+    """
     present = {unravel_key(key) for key in td.keys(True, True)}  # keys of a lazy stack find no nested ones
     declared = symmetry.keys()
     wanted = declared if select is None else [key for key in declared if key in select]
-    missing = [key for key in wanted if key not in present]
+    missing = [key for key in wanted if key not in present and not is_recurrent_state(key)]
     if missing and symmetry.strict:
         raise KeyError(
             f"the batch lacks {missing}, which the symmetry declares; it has "

@@ -145,8 +145,8 @@ class Declaration:
         if unknown:
             raise KeyError(
                 f"the batch has {unknown}, which this symmetry does not know (it has {self.keys}); add "
-                "their representations, e.g. invariant(group, d) for what no element changes, drop them "
-                "with select=..., or pass strict=False to copy unknown entries unchanged"
+                "their representations, e.g. invariant(group, d) for what no element changes, exclude "
+                "them from the batch, or pass strict=False to copy unknown entries unchanged"
             )
         return parts
 
@@ -208,8 +208,8 @@ class Declaration:
         raise KeyError(
             f"the batch has {bare!r} with one value for each component of the action, {tuple(event)}, but "
             "the action's representation mixes components, which carries no such value to another; use a "
-            "distribution with one log-probability per action (IndependentNormal), drop the entry with "
-            "select=..., or declare it with invariant(group, d) if all its components are equal"
+            "distribution with one log-probability per action (IndependentNormal), exclude the entry "
+            "from the batch, or declare it with invariant(group, d) if all its components are equal"
         ) from found
 
     def _exchanged(self, bare: NestedKey) -> tuple[list[NestedKey], int] | None:

@@ -58,7 +58,9 @@ class Exchanged:
         keys: two or more keys.
 
     Example:
-        >>> from torchrl_sym import PointGroup, Symmetry
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl_sym import Exchanged, PointGroup, Symmetry
         >>> from torchrl_sym.representations import signed_permutation
         >>> group = PointGroup.reflection("y")
         >>> hands = signed_permutation(group, ["l", "r"], {"reflect-y": {"l": "-r", "r": "-l"}})

@@ -192,6 +192,9 @@ class Memory:
     def rebuild(self, copies: TensorDictBase, element: Tensor | None = None) -> TensorDictBase:
         """Copies that begin from zero memory, their originals from what is stored.
 
+        What is stored under ``"next"`` is that after one step, of which copies know nothing: it is left
+        out, so that the values of next states, of originals and copies alike, begin from zero memory.
+
         Args:
             copies: an orbit ``[N, *B]``, the originals first; not modified.
             element: instead, the element that each one of a batch ``[*B]`` is under, 0 the identity.
@@ -199,7 +202,8 @@ class Memory:
         if not self.rebuilt:
             return copies
         mirrored = torch.arange(len(copies), device=_device(copies)) if element is None else element
-        copies, mirrored = copies.copy(), mirrored != 0
+        mirrored = mirrored != 0
+        copies = copies.exclude(*[unravel_key(("next", key)) for key in self.rebuilt])
         for key in self.rebuilt:
             value = copies.get(key, None)
             if value is not None:

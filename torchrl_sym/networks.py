@@ -116,7 +116,7 @@ class Effect:
 
     def _restart(self) -> None:
         self._parameters: list[nn.Parameter] | None = None
-        self._seen: tuple[list[int], list[Tensor]] | None = None
+        self._seen: tuple[int, list[int], list[Tensor]] | None = None
         self._proven = False
 
     def __getstate__(self) -> dict[str, HeldNetwork]:  # a copy's counters start anew
@@ -157,11 +157,11 @@ class Effect:
             return  # cleared again and again: an optimizer holds them
         versions = [p._version for p in parameters]
         sums = [p.detach().sum(dtype=torch.promote_types(p.dtype, torch.float32)) for p in parameters]
-        if self._seen is None:
-            self._seen = versions, sums
-        elif piled >= patience:
+        if self._seen is None:  # the counters may be high already, from an earlier training
+            self._seen = piled, versions, sums
+        elif piled - self._seen[0] >= patience - patience // 2:
             # a fused optimizer counts no change, so that the values decide; once in a run
-            same = versions == self._seen[0] and all(map(torch.equal, sums, self._seen[1]))
+            same = versions == self._seen[1] and all(map(torch.equal, sums, self._seen[2]))
             if same:
                 raise RuntimeError(
                     f"{piled} gradients have been added up in the parameters of the network that writes "

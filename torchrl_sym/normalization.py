@@ -77,7 +77,8 @@ class SymmetricNorm(nn.Module):
     In every way what rsl_rl calls an empirical normalisation, but for its statistics, which are those of
     the data and their images under the group: ``f(rho(g) x) = rho(g) f(x)`` for every element, always.
     In training mode nothing is updated by itself: call :meth:`update` once with new data, or construct it
-    with ``update_in_forward=True``.
+    with ``update_in_forward=True``. A loss that expands a network (SAC, TD3, REDQ) trains copies of it,
+    whose statistics neither reaches reliably: there, normalise by a :class:`~torchrl_sym.SymmetricVecNorm`.
 
     Args:
         *representations: how each input transforms; as many as :meth:`forward` gets inputs.

@@ -35,6 +35,7 @@ class Copies:
         expanded: the rows to evaluate, ``[N * B, ...]``, or ``[B, ...]`` if drawn.
         element: the drawn elements, ``[B, ...]``; None with all of them.
         count: number of elements N.
+        valid: which of the rows to evaluate are no padding; None if all are.
     """
 
     def __init__(
@@ -51,8 +52,9 @@ class Copies:
         if isinstance(originals, LazyStackedTensorDict):
             originals = originals.contiguous()  # TorchRL's losses read no log-probability from lazy stacks
         self.td = originals
-        self.mask_keys = list(mask_keys)
-        if elements is None:
+        if elements == [0]:  # there is nothing to copy
+            self.count, self.element, self.expanded = 1, None, originals
+        elif elements is None:
             self.count = symmetry.group.order
             self.element = memory.draw(symmetry, originals)
             copies = symmetry.per_row(originals, self.element, keys=keys, followers=followers)
@@ -62,13 +64,15 @@ class Copies:
             self.element = None
             orbit = symmetry.orbit(originals, elements, keys=keys, followers=followers)
             self.expanded = memory.rebuild(orbit).reshape(-1, *originals.batch_size[1:])
+        self.valid = valid_rows(self.expanded, mask_keys)
+        self._weight = self._counted()
 
     def originals(self, x):
         """Rows of the identity, of a tensor or tensordict: such that their mean is theirs.
 
         Drawn rows are all there, weighted by whether they drew the identity.
         """
-        own = self._weight()
+        own = self._weight
         if self.element is None or own is None:
             return x[: len(x) // self.count]
         own, valid = own[0], self.valid
@@ -96,22 +100,24 @@ class Copies:
         counted = valid.reshape(valid.shape + (1,) * (x.ndim - valid.ndim)).expand_as(x)
         return torch.where(counted, x, 0).sum() / counted.sum().clamp_min(1)
 
-    def report(self, td_out: TensorDictBase, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> None:
+    def report(self, kl: Tensor, clipped: Tensor, log_ratio: Tensor) -> dict[str, Tensor]:
         """Diagnostics of the original rows, and of every element under ``*_sym``, ``(N,)``."""
+        out = {}
         for name, value in (("kl_approx", kl.detach()), ("clip_fraction", clipped)):
-            means = self.means(value)
-            td_out.set(name, means[0])
-            td_out.set(f"{name}_sym", means)
+            out[f"{name}_sym"] = self.means(value)
+            out[name] = out[f"{name}_sym"][0]
         log_ratio = log_ratio.detach().squeeze(-1)
-        td_out.set("mean_ratio", self.mean(log_ratio.exp()))
+        out["mean_ratio"] = self.mean(log_ratio.exp())
 
         values, weight = self._table(log_ratio)
         if weight is not None:
             values = values.masked_fill(weight == 0, -torch.inf)
-        td_out.set("max_ratio", values[0].max().exp())
+        out["max_ratio"] = values[0].max().exp()
         own, counted = (None, None) if weight is None else (weight[0], weight.flatten(1))
-        td_out.set("ESS", _effective_share(values[0], own, 0))
-        td_out.set("ESS_sym", _effective_share(values.flatten(1), counted, 1))
+        out["ESS_sym"] = _effective_share(values.flatten(1), counted, 1)
+        # over the first dimension, as ClipPPOLoss takes it: of every step of sequences, of every agent
+        out["ESS"] = out["ESS_sym"][0] if values.ndim == 2 else _effective_share(values[0], own, 0)
+        return out
 
     def _table(self, x: Tensor) -> tuple[Tensor, Tensor | None]:
         """Values of every element's rows, ``(N, B, ...)``, and whether each counts; None if all do."""
@@ -119,32 +125,31 @@ class Copies:
             values = x.unflatten(0, (self.count, -1))
         else:
             values = x.expand(self.count, *x.shape)
-        weight = self._weight()
+        weight = self._weight
         if weight is not None:
             weight = weight.reshape(weight.shape + (1,) * (values.ndim - weight.ndim)).expand_as(values)
         return values, weight
 
-    def _weight(self) -> Tensor | None:
+    def _counted(self) -> Tensor | None:
         """1 where a row is one of an element's and no padding, ``(N, B, ...)``; None if all are."""
-        valid = self.valid
         if self.element is None:
-            counted = None if valid is None else valid.unflatten(0, (self.count, -1))
+            counted = None if self.valid is None else self.valid.unflatten(0, (self.count, -1))
         else:
             index = torch.arange(self.count, device=self.element.device)
             counted = self.element == index.reshape(-1, *[1] * self.element.ndim)
-            counted = counted if valid is None else counted & valid
+            counted = counted if self.valid is None else counted & self.valid
         return None if counted is None else counted.to(torch.get_default_dtype())
 
-    @property
-    def valid(self) -> Tensor | None:
-        """Which of the rows to evaluate are no padding, ``[N * B, ...]``; None if all are."""
-        valid = None
-        for key in self.mask_keys:
-            mask = self.expanded.get(key, None)
-            if mask is not None:
-                mask = mask.reshape(self.expanded.batch_size)
-                valid = mask if valid is None else valid & mask
-        return valid
+
+def valid_rows(td: TensorDictBase, mask_keys: Iterable[NestedKey]) -> Tensor | None:
+    """Which rows are no padding; None if all are."""
+    valid = None
+    for key in mask_keys:
+        mask = td.get(key, None)
+        if mask is not None:
+            mask = mask.reshape(td.batch_size)
+            valid = mask if valid is None else valid & mask
+    return valid
 
 
 def variance(x: Tensor, valid: Tensor | None) -> Tensor:

@@ -203,25 +203,26 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
         log_weight, dist, kl_approx, log_is_weight = self._log_weight(
             rows.expanded, adv_shape=advantage.shape[:-1]
         )
-        advantage = broadcast_advantage_to_log_weight(advantage, log_weight)
-        check_advantage_broadcast(advantage, log_weight)
+        if advantage.shape != log_weight.shape:
+            advantage = broadcast_advantage_to_log_weight(advantage, log_weight)
+            check_advantage_broadcast(advantage, log_weight)
         # with a proximal policy or a capped ratio, the surrogate is weighted by the behaviour ratio
         behaviour = log_weight if log_is_weight is None else log_weight + log_is_weight
         clipped = log_weight.clamp(*self._clip_bounds)
         gain1 = behaviour.exp() * advantage
         gain2 = (clipped if log_is_weight is None else clipped + log_is_weight).exp() * advantage
-        gain = torch.stack([gain1, gain2], -1).min(dim=-1).values
+        gain = torch.minimum(gain1, gain2)
 
-        td_out = TensorDict(loss_objective=-gain)
+        out: dict[str, Any] = {"loss_objective": -gain}
         with torch.no_grad():
-            rows.report(td_out, kl_approx, (clipped != log_weight).to(gain.dtype), behaviour)
+            out |= rows.report(kl_approx, (clipped != log_weight).to(gain.dtype), behaviour)
         if self.entropy_bonus:
-            self._report_entropy(td_out, self._get_entropy(dist, adv_shape=advantage.shape[:-1]), rows)
+            out |= self._report_entropy(self._get_entropy(dist, adv_shape=advantage.shape[:-1]), rows)
         if self._has_critic:
-            self._report_critic(td_out, rows)
+            out |= self._report_critic(rows)
         if self._mirrors:
-            td_out.set("loss_mirror", self.mirror_coeff * self._mirror_error(rows, dist))
-        td_out = td_out.named_apply(lambda name, value: self._reduce(name, value, rows))
+            out["loss_mirror"] = self.mirror_coeff * self._mirror_error(rows, dist)
+        td_out = TensorDict({name: self._reduce(name, value, rows) for name, value in out.items()})
         self._clear_weakrefs(
             td,
             td_out,
@@ -276,17 +277,17 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             return super()._get_entropy(dist, adv_shape)
         return dist.entropy().unsqueeze(-1)
 
-    def _report_entropy(
-        self, td_out: TensorDictBase, entropy: Tensor | TensorDictBase, rows: Copies
-    ) -> None:
+    def _report_entropy(self, entropy: Tensor | TensorDictBase, rows: Copies) -> dict[str, Any]:
+        out: dict[str, Any] = {}
         total = entropy
         if is_tensor_collection(entropy):  # one entropy per action head
-            td_out.set("composite_entropy", rows.originals(entropy.detach()))
+            out["composite_entropy"] = rows.originals(entropy.detach())
             total = entropy.sum(dim="feature", reduce=True)  # pyright: ignore[reportCallIssue]
-        td_out.set("entropy", rows.mean(total.detach()))
-        td_out.set("loss_entropy", self._weighted_loss_entropy(rows.originals(entropy)))
+        out["entropy"] = rows.mean(total.detach())
+        out["loss_entropy"] = self._weighted_loss_entropy(rows.originals(entropy))
+        return out
 
-    def _report_critic(self, td_out: TensorDictBase, rows: Copies) -> None:
+    def _report_critic(self, rows: Copies) -> dict[str, Tensor]:
         """Value loss of all rows; what was clipped, and the variance explained, of those that count."""
         td = rows.expanded.detach() if self.separate_losses else rows.expanded
         keys = self.tensor_keys
@@ -307,6 +308,7 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             )
         target, value, old = self._critic_loss_inputs(target, value, old)
 
+        out = {}
         loss = distance_loss(target, value, loss_function=self.loss_critic_type)
         if old is not None and self.clip_value is not None and self._clips_value:
             change = value - old
@@ -314,13 +316,14 @@ class SymmetricClipPPOLoss(ClipPPOLoss):
             other = distance_loss(target, old + bounded, loss_function=self.loss_critic_type)
             loss = torch.maximum(loss, other)
             clipped = (change.detach() != bounded.detach()).to(value.dtype)
-            td_out.set("value_clip_fraction", rows.overall_mean(clipped))
-        td_out.set("loss_critic", self.critic_coeff * loss)
+            out["value_clip_fraction"] = rows.overall_mean(clipped)
+        out["loss_critic"] = self.critic_coeff * loss
 
         if self.log_explained_variance:
             target, value = target.detach(), value.detach()
             total = variance(target, rows.valid) + torch.finfo(target.dtype).eps
-            td_out.set("explained_variance", 1.0 - variance(target - value, rows.valid) / total)
+            out["explained_variance"] = 1.0 - variance(target - value, rows.valid) / total
+        return out
 
     @contextlib.contextmanager
     def _using(self, network: str) -> Iterator[None]:

@@ -300,6 +300,9 @@ class Symmetry(nn.Module):
         Boxes of observations that turn by less than a right angle are not checked: no box is mapped
         onto itself then, and nothing depends on it.
 
+        Transforms are tried out, also those of workers. Of gymnasium's wrappers only NormalizeObservation
+        is looked for.
+
         Raises:
             KeyError: observations or actions of the environment are not declared (strict), but for those
                 that TorchRL's counters (StepCounter, RewardSum, InitTracker) write.

@@ -47,6 +47,15 @@ class Layout:
         ]
         return torch.cat([torch.zeros(steps, *self.batch, 0, dtype=torch.float64), *values], -1)
 
+    def opposite(self, rows: Tensor) -> Tensor:
+        """Values ``(*B, dim)`` that all differ: the other side of the box, or of zero; the other flag."""
+        parts = zip(self.specs.values(), rows.split(self.sizes, -1), self.events.values(), strict=True)
+        batch = rows.shape[:-1]
+        values = [
+            _opposite(spec, part.reshape(*batch, *event)).reshape(*batch, -1) for spec, part, event in parts
+        ]
+        return torch.cat([rows[..., :0], *values], -1)
+
     def flatten(self, td: TensorDictBase) -> Tensor:
         """Entries ``(*B, *event)`` as ``(*B, dim)``; NaN for missing ones."""
         rows = [torch.zeros(*td.batch_size, 0, dtype=torch.float64)]
@@ -96,16 +105,29 @@ class Layout:
 
 
 def _draw(spec: TensorSpec, size: float) -> Tensor:
-    space = spec.space
-    if isinstance(space, ContinuousBox) and spec.dtype.is_floating_point:
-        low, high = (bound.double().cpu().expand(spec.shape) for bound in (space.low, space.high))
-        free = torch.randn(spec.shape, dtype=torch.float64) * size
-        within = low + torch.rand(spec.shape, dtype=torch.float64) * (high - low)
-        wide = (high - low > 1e6) | ~(high - low).isfinite()
-        return torch.where(wide, free.maximum(low).minimum(high), within)
-    if spec.dtype.is_floating_point:
-        return torch.randn(spec.shape, dtype=torch.float64) * size
-    return spec.rand().double().cpu()
+    if not spec.dtype.is_floating_point:
+        return spec.rand().double().cpu()
+    free = torch.randn(spec.shape, dtype=torch.float64) * size
+    if not isinstance(spec.space, ContinuousBox):
+        return free
+    low, high, wide = _box(spec)
+    within = low + torch.rand(spec.shape, dtype=torch.float64) * (high - low)
+    return torch.where(wide, free.maximum(low).minimum(high), within)
+
+
+def _opposite(spec: TensorSpec, value: Tensor) -> Tensor:
+    if not spec.dtype.is_floating_point:
+        return (value == 0).double()
+    if not isinstance(spec.space, ContinuousBox):
+        return -value
+    low, high, wide = _box(spec)
+    return torch.where(wide, (-value).maximum(low).minimum(high), low + high - value)
+
+
+def _box(spec: TensorSpec) -> tuple[Tensor, Tensor, Tensor]:
+    """Bounds, and where they are so wide that they say nothing."""
+    low, high = (end.double().cpu().expand(spec.shape) for end in (spec.space.low, spec.space.high))
+    return low, high, (high - low > 1e6) | ~(high - low).isfinite()
 
 
 class Played(EnvBase):

@@ -4,17 +4,20 @@ What a symmetry declares is what an environment gives out and takes in, behind a
 transform in between may spoil it: measured constants, running statistics, a clip that is wider on one side.
 It may be of any class, the user's own, in front of a concatenation, or inside a worker. So all of them are
 tried out (:mod:`torchrl_sym.environments.trial`), shell by shell down to the bare environment. Where that
-is impossible, only transforms that are known to keep statistics of each entry by itself are refused.
+is impossible, only transforms that are known to keep statistics of each entry by itself are refused. So are
+gymnasium's; of its other wrappers, which are part of the bare environment, nothing is known.
 """
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Sequence
 
 from tensordict import NestedKey
 from torchrl.envs import EnvBase, Transform, TransformedEnv, VecNorm, VecNormV2
 
+from torchrl_sym._torchrl import wrappers_of
 from torchrl_sym.environments.inside import inside, shell, undisturbed
 from torchrl_sym.environments.trial import Declared, Trial
 
@@ -39,6 +42,7 @@ def check_transforms(env: EnvBase, declared: Declared) -> None:
 def _descend(env: EnvBase, declared: Declared) -> None:
     if isinstance(env, TransformedEnv) and shell(env):
         declared = _check_shell(env, declared)
+    _refuse_gymnasium(env, declared)
     with inside(env) as inner:
         for each in inner:
             _descend(each, declared)
@@ -71,16 +75,33 @@ def _check_shell(env: TransformedEnv, declared: Declared) -> Declared:
 
 
 def _trial(env: TransformedEnv, transforms: Sequence[Transform], declared: Declared) -> Trial | None:
-    """None if they cannot be tried out."""
+    """None if they cannot be tried out; without those that add noise, which would hide the others."""
+    trial = _attempt(env, transforms, declared)
+    if trial is None or not trial.is_random:
+        return trial
+    for count in range(1, len(transforms) + 1):  # the fewest that will do
+        for left_out in itertools.combinations(transforms, count):
+            trial = _attempt(env, [t for t in transforms if t not in left_out], declared)
+            if trial is not None and not trial.is_random:
+                known = all(_is_noise(env, t, transforms, trial) for t in left_out)
+                return trial if known else None
+    return None
+
+
+def _attempt(env: TransformedEnv, transforms: Sequence[Transform], declared: Declared) -> Trial | None:
     try:
-        trial = Trial(env, transforms, declared)
+        return Trial(env, transforms, declared)
     except Exception:  # whatever a user's transform raises when it is away from its environment
         return None
-    for transform in transforms if trial.is_random else ():  # noise on observations: try without it
-        without = _trial(env, [t for t in transforms if t is not transform], declared)
-        if without is not None and not without.is_random:
-            return without
-    return trial
+
+
+def _is_noise(
+    env: TransformedEnv, transform: Transform, transforms: Sequence[Transform], quiet: Trial
+) -> bool:
+    """Whether a transform makes random what was not; another may only need what it draws."""
+    both = [t for t in transforms if t is transform or t in quiet.transforms]
+    trial = _attempt(env, both, quiet.declared)
+    return trial is not None and trial.is_random
 
 
 def _is_right_without(env: TransformedEnv, trial: Trial, transform: Transform) -> bool:
@@ -109,6 +130,17 @@ def _refuse_untried(transform: Transform, related: set[NestedKey]) -> None:
         "not known; make sure that it does",
         stacklevel=2,
     )
+
+
+def _refuse_gymnasium(env: EnvBase, declared: Declared) -> None:
+    observed = set(declared.keys) & {*env.observation_spec.keys(True, True)}
+    for wrapper in wrappers_of(env) if observed else []:
+        classes = [kind.__name__ for kind in type(wrapper).__mro__]
+        if "NormalizeObservation" in classes and not getattr(wrapper, "is_symmetric", False):
+            raise ValueError(
+                f"gymnasium's {type(wrapper).__name__} keeps statistics of each entry of "
+                f"{sorted(map(str, observed))}, which are not symmetric; leave it out, and {_REMEDY}"
+            )
 
 
 def _refuse_statistics(transform: Transform, related: set[NestedKey]) -> None:

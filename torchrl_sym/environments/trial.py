@@ -56,7 +56,7 @@ class Trial:
         declared: what is known outside.
 
     Attributes:
-        is_random: the same sources have had different results.
+        is_random: the same sources have had different results, so that nothing else is known.
         judged: of which results it is known what they should be, ``(results,)``.
         undecided: whether there are declared entries among the others.
 
@@ -76,7 +76,7 @@ class Trial:
         self.is_single = not any(s.dtype in halves for each in layouts for s in each.specs.values())
 
         torch.default_generator.manual_seed(0)  # not CUDA's, which it might initialise
-        self.plain, other = self._draw(1.0), self._draw(1.0)
+        self.plain = self._draw(1.0)
         self.state = copies(transforms, env)
         # statistics that nobody would call symmetric, the same for all rows
         row = self.plain[(slice(None), *[slice(0, 1)] * len(env.batch_size))]
@@ -90,7 +90,8 @@ class Trial:
         self.result = self(self.plain)
         self.present = ~_anywhere(self.result.isnan())
         self.is_random = bool((self._differs(self(self.plain, seed=1)) & self.present).any())
-        self._find_sources(other)
+        if not self.is_random:
+            self._find_sources([self._opposite(), *map(self._draw, _SIZES)])
 
     def __call__(self, sources: Tensor, seed: int = 0) -> Tensor:
         """Results ``(*B, results)`` of sources ``(steps, *B, sources)``, always from the same state."""
@@ -107,23 +108,34 @@ class Trial:
     def _draw(self, size: float) -> Tensor:
         return torch.cat([self.raw.draw(_STEPS, size), self.sent.draw(_STEPS, size)], -1)
 
+    def _opposite(self) -> Tensor:
+        raw, sent = self.plain.split([self.raw.dim, self.sent.dim], -1)
+        return torch.cat([self.raw.opposite(raw), self.sent.opposite(sent)], -1)
+
     def _differs(self, result: Tensor) -> Tensor:
         return _anywhere((result != self.result) & ~result.isnan())
 
-    def _find_sources(self, other: Tensor) -> None:
-        """Number the sources; change those whose number has a one at a bit, then those that have a zero."""
+    def _find_sources(self, others: Sequence[Tensor]) -> None:
+        """Number the sources; change those whose number has a one at a bit, then those that have a zero.
+
+        Others are values to change them to: a flag, a sign, a clipped entry does not notice every change.
+        """
+        size = self.seen.dim
+        known = self.seen.mask(self.declared.keys)
+        wanted = torch.cat([known, torch.ones(self.taken.dim, dtype=torch.bool)]) & self.present
         numbers = torch.arange(1, self.plain.shape[-1] + 1)  # 0 for no source
         bits = len(numbers).bit_length()
         ones, zeros = torch.zeros(2, self.result.shape[-1], dtype=torch.int64)
-        for bit in range(bits):
-            has = (numbers >> bit & 1).bool()
-            ones += self._differs(self(torch.where(has, other, self.plain))).long() << bit
-            zeros += self._differs(self(torch.where(has, self.plain, other))).long() << bit
+        for other in others:
+            for bit in range(bits):
+                has = (numbers >> bit & 1).bool()
+                ones |= self._differs(self(torch.where(has, other, self.plain))).long() << bit
+                zeros |= self._differs(self(torch.where(has, self.plain, other))).long() << bit
+            if (ones | zeros)[wanted].eq((1 << bits) - 1).all():
+                break
         source = torch.where(ones ^ zeros == (1 << bits) - 1, ones, 0) - 1  # -1: none, or several
         several = (ones | zeros != 0) & (source < 0)
 
-        size = self.seen.dim
-        known = self.seen.mask(self.declared.keys)
         followed = self._closed(known & ~several[:size]) & (source[:size] >= 0)
         self.observed = _Links(source[:size], followed, len(numbers))
         sent = torch.cat([self.raw.mask([]), self.sent.mask(self.declared.keys)])
@@ -133,7 +145,8 @@ class Trial:
         self.direct = [key for key in self.raw.events if self._is_direct(key)]
         direct = torch.cat([self.raw.mask(self.direct), self.sent.mask([])])
         self.covered = self.observed.has_result | sent | direct
-        unknown = self._differs(self(torch.where(self.covered, self.plain, other)))
+        hidden = [self._differs(self(torch.where(self.covered, self.plain, other))) for other in others]
+        unknown = torch.stack(hidden).any(0)
         self.judged = torch.cat([known & ~unknown[:size], arrives]) & self.present
         self.undecided = bool((known & ~self.judged[:size]).any())
 

@@ -1,7 +1,8 @@
 """What an audit says: its verdict and table, what it warns of, and what it does not look at.
 
-Even an exactly symmetric model is simulated symmetrically only if the solver treats all contacts alike and
-the friction cones look the same from every side. The warnings name the settings for which that fails.
+Even an exactly symmetric model is simulated symmetrically only if the solver treats all contacts alike, the
+friction cones look the same from every side, and contacts are found by formulas rather than by iteration.
+The warnings name the settings, and the pairs of geoms, for which that fails.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.contacts import contact_warnings
 from torchrl_sym.mujoco.geoms import active_geoms
 from torchrl_sym.mujoco.links import BALL, FREE, HINGE, SLIDE, MjModel, mj, name_of
 
@@ -39,7 +41,7 @@ class AuditReport:
         residuals: one row per term and element that the model has.
         tolerance: largest residual that counts as exact.
         reason: why the model lacks the symmetry, None if it has it at least approximately.
-        warnings: settings under which even an exact model is not simulated symmetrically.
+        warnings: settings and contacts with which even an exact model is not simulated symmetrically.
         unchecked: what was not compared.
     """
 
@@ -100,7 +102,7 @@ def phrase(row: Residual) -> str:
 
 
 def simulation_warnings(model: MjModel, group: PointGroup) -> tuple[str, ...]:
-    """Settings under which the simulator breaks a symmetry that the model has."""
+    """Settings and contacts with which the simulator breaks a symmetry that the model has."""
     out, option = [], model.opt
     solver = mj.mjtSolver(option.solver)
     if solver != mj.mjtSolver.mjSOL_NEWTON:
@@ -134,7 +136,7 @@ def simulation_warnings(model: MjModel, group: PointGroup) -> tuple[str, ...]:
         for name, matrix in zip(group.names, group.matrices.numpy(), strict=True):
             if not np.allclose(np.linalg.det(matrix) * matrix @ field, field, atol=1e-9):
                 out.append(f"{name!r} turns the magnetic field, so that magnetometers break it")
-    return tuple(out)
+    return (*out, *contact_warnings(model))
 
 
 def _can_yaw(model: MjModel) -> bool:

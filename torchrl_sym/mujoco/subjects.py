@@ -2,23 +2,26 @@
 
 An environment is recognised by what it offers, not by its class. A batched task environment maps its full
 state itself; of a dm_control `Environment` and a gymnasium `MujocoEnv` the state is that of MuJoCo, mapped
-by what :func:`~torchrl_sym.mujoco.derive` finds in the model.
+by what :func:`~torchrl_sym.mujoco.derive` finds in the model, and what they are said to remember beside.
 """
 
 from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict
 from torch import Tensor
+from torchrl.envs import EnvBase
 
+from torchrl_sym._torchrl import wrapped_env
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.links import MjModel, mj
+from torchrl_sym.mujoco.remembered import Remembered
 from torchrl_sym.symmetry import Symmetry
 
 Observation: TypeAlias = dict[NestedKey, Tensor]
@@ -34,7 +37,7 @@ class Pose:
 
 @dataclass
 class PhysicsState:
-    """State of one MuJoCo simulation as tensors with one row."""
+    """State of one MuJoCo simulation as tensors with one row, and what its environment remembers beside."""
 
     qpos: Tensor
     qvel: Tensor
@@ -44,11 +47,12 @@ class PhysicsState:
     ctrl: Tensor
     qacc_warmstart: Tensor
     time: float
+    memory: dict[str, Any] = field(default_factory=dict)
 
     def rows(self, ids: slice) -> PhysicsState:
         """A copy."""
-        copies = {name: x[ids].clone() for name, x in vars(self).items() if name != "time"}
-        return PhysicsState(**copies, time=self.time)
+        copies = {name: x[ids].clone() for name, x in vars(self).items() if isinstance(x, Tensor)}
+        return PhysicsState(**copies, time=self.time, memory=self.memory)
 
 
 @dataclass
@@ -159,20 +163,22 @@ class BatchedSubject(Subject):
 
 
 class PhysicsSubject(Subject):
-    """One MuJoCo simulation, its state mapped through `derive`."""
+    """One MuJoCo simulation, its state mapped through `derive`; ``owner`` is what has the memory."""
 
     rows = 1
     data: Any
 
     def __init__(
         self,
+        owner: Any,
         model: MjModel,
         symmetry: Symmetry,
         observe: Callable[[Any], Any] | None,
         pose: Pose,
+        memory: Remembered | None,
     ) -> None:
         super().__init__(symmetry, observe)
-        self.model = model
+        self.owner, self.model, self.memory = owner, model, memory
         self.robot = derive(model, symmetry.group, pose.keyframe, carried=pose.carried)
 
     @abc.abstractmethod
@@ -182,13 +188,16 @@ class PhysicsSubject(Subject):
     def state(self) -> PhysicsState:
         fields = ("qpos", "qvel", "mocap_pos", "mocap_quat", "act", "ctrl", "qacc_warmstart")
         rows = {f: torch.as_tensor(np.array(getattr(self.data, f)))[None] for f in fields}
-        return PhysicsState(**rows, time=float(self.data.time))
+        memory = self.memory.read(self.owner) if self.memory else {}
+        return PhysicsState(**rows, time=float(self.data.time), memory=memory)
 
     def load(self, state: PhysicsState) -> Observation:
         write_state(self.data, state)
         mj.mj_forward(self.model, self.data)
         mj.mj_rnePostConstraint(self.model, self.data)  # contact forces, which some observe
         self.data.qacc_warmstart[:] = state.qacc_warmstart[0].numpy()  # mj_forward replaced it
+        if self.memory:
+            self.memory.write(self.owner, state.memory)
         return self.observe()
 
     def transform(self, state: PhysicsState, g: int) -> PhysicsState:
@@ -205,6 +214,7 @@ class PhysicsSubject(Subject):
             ctrl=robot.map_ctrl(state.ctrl, g) if self.model.nu else state.ctrl,
             qacc_warmstart=robot.map_qvel(state.qacc_warmstart, g),
             time=state.time,
+            memory=self.memory.image(state.memory, g) if self.memory else {},
         )
 
     def outcome(self, reward: Any, terminated: bool, truncated: bool) -> Outcome:
@@ -220,8 +230,10 @@ class PhysicsSubject(Subject):
 class ControlSubject(PhysicsSubject):
     """A dm_control `Environment`: `physics` and `task`."""
 
-    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> None:
-        super().__init__(env.physics.model.ptr, symmetry, observe, pose)
+    def __init__(
+        self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int, memory: Remembered | None
+    ) -> None:
+        super().__init__(env, env.physics.model.ptr, symmetry, observe, pose, memory)
         self.env, self.data = env, env.physics.data.ptr
         self.substeps = round(env.control_timestep() / env.physics.timestep())
         spec = env.action_spec()
@@ -250,9 +262,11 @@ class ControlSubject(PhysicsSubject):
 class GymnasiumSubject(PhysicsSubject):
     """A gymnasium `MujocoEnv`, with wrappers that map single actions, observations or rewards."""
 
-    def __init__(self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> None:
+    def __init__(
+        self, env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int, memory: Remembered | None
+    ) -> None:
         self.base = env.unwrapped
-        super().__init__(self.base.model, symmetry, observe, pose)
+        super().__init__(self.base, self.base.model, symmetry, observe, pose, memory)
         self.data = self.base.data
         space = env.action_space
         self.low, self.high = (torch.as_tensor(np.array(x)).double() for x in (space.low, space.high))
@@ -289,25 +303,32 @@ def write_state(data: Any, state: Any, row: int = 0) -> None:
     data.time = float(torch.as_tensor(state.time).reshape(-1)[row])
 
 
-def subject_of(env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int) -> Subject:
+def subject_of(
+    env: Any, symmetry: Symmetry, observe: Any, pose: Pose, seed: int, memory: Remembered | None = None
+) -> Subject:
     """The environment behind the interface, by what it offers.
 
     Raises:
         TypeError: an environment of another kind.
+        ValueError: a pose or memory for one that maps its whole state itself.
     """
+    if isinstance(env, EnvBase):
+        env = wrapped_env(env)
     if not hasattr(env, "base_env"):
         if hasattr(env, "reset_to") and hasattr(getattr(env, "task", None), "transform_state"):
-            if pose != Pose():
+            if pose != Pose() or memory is not None:
+                names = memory and list(memory.representations)
                 raise ValueError(
-                    "expected neither keyframe nor carried for a batched task environment, which maps its "
-                    f"state itself, got {pose.keyframe!r} and {pose.carried!r}; leave them out"
+                    "expected neither keyframe, carried nor memory for a batched task environment, which "
+                    f"maps its state itself, got {pose.keyframe!r}, {pose.carried!r} and {names}; leave "
+                    "them out, and keep what it remembers in its state"
                 )
             return BatchedSubject(env, symmetry, observe, seed)
         if all(hasattr(env, name) for name in ("physics", "task", "action_spec")):
-            return ControlSubject(env, symmetry, observe, pose, seed)
+            return ControlSubject(env, symmetry, observe, pose, seed, memory)
         base = getattr(env, "unwrapped", None)
         if all(hasattr(base, name) for name in ("model", "data", "set_state", "_get_obs")):
-            return GymnasiumSubject(env, symmetry, observe, pose, seed)
+            return GymnasiumSubject(env, symmetry, observe, pose, seed, memory)
     raise TypeError(
         "expected a batched task environment (reset_to, task.transform_state), a dm_control Environment "
         f"(physics, task) or a gymnasium MujocoEnv (model, data, set_state, _get_obs), got "

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,92 +23,17 @@ from torch import Tensor
 
 from torchrl_sym import checks
 from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
+from torchrl_sym.mujoco.remembered import Remembered, remembered
 from torchrl_sym.mujoco.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
+from torchrl_sym.mujoco.verify_report import PARTS, VerifyReport, VerifyRow
+from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 
-# In the order of cause: a wrong part makes those after it wrong as well. States come before observations,
-# which may contain forces, and on which no state depends.
-PARTS = (
-    *("action box", "dynamics", "contact", "kinematics", "reward", "termination"),
-    *("next observation", "rollout", "reset"),
-)
 MAX_WARM_UP = 50  # random actions before a state is tested
 MOST = 100_000  # states, or steps: more would take days
 RESETS = 400  # starts in each of the two samples that are compared
 SIGNIFICANCE = 1e-3  # chance that a symmetric start distribution fails, over all entries and elements
 FLOAT32_TOLERANCE = 2e-6  # rounding of observations and rewards in single precision
-
-
-@dataclass(frozen=True)
-class VerifyRow:
-    """One residual: of which part and element, how large, and in which entry or joint it is worst.
-
-    Residuals are relative to the largest value of their entry, or 1 if that is smaller. Those of
-    ``"reset"`` are Kolmogorov-Smirnov distances; that of ``"termination"`` is a fraction of states.
-    """
-
-    part: str
-    element: str
-    value: float
-    limit: float
-    where: str
-
-    @property
-    def passed(self) -> bool:
-        return self.value <= self.limit
-
-    @property
-    def excess(self) -> float:
-        """Value over limit."""
-        if self.limit > 0:
-            return self.value / self.limit
-        return math.inf if self.value > 0 else 0.0
-
-    def __str__(self) -> str:
-        verdict = "reported" if math.isinf(self.limit) else "ok" if self.passed else "FAILED"
-        limit = "" if math.isinf(self.limit) else f"{self.limit:.1e}"
-        size = f"{self.value:9.2e} {limit:>9s}"
-        return f"{self.part:<17s} {self.element:<12s} {size}  {verdict:<8s}  {self.where}"
-
-
-@dataclass
-class VerifyReport:
-    """What :func:`verify` measured; ``str()`` makes it a table.
-
-    Attributes:
-        rows: all residuals, by part.
-        states: number of states tested.
-        contacts: how many of them were in contact. With none, contact was not tested.
-        identity: name of the identity, whose rows the table leaves out while they pass.
-    """
-
-    rows: list[VerifyRow]
-    states: int
-    contacts: int
-    identity: str = "identity"
-
-    @property
-    def passed(self) -> bool:
-        return all(row.passed for row in self.rows)
-
-    @property
-    def worst(self) -> VerifyRow:
-        """The largest failure of the first part that fails; the row nearest its limit if none does."""
-        failed = [row for row in self.rows if not row.passed]
-        first = [row for row in failed if row.part == failed[0].part]
-        return max(first or self.rows, key=lambda row: row.excess)
-
-    def of(self, part: str) -> list[VerifyRow]:
-        """Rows of one part."""
-        checks.one_of("part", part, PARTS, KeyError)
-        return [row for row in self.rows if row.part == part]
-
-    def __str__(self) -> str:
-        verdict = "symmetric" if self.passed else f"not symmetric, first in {self.worst.part}"
-        shown = [row for row in self.rows if row.element != self.identity or not row.passed]
-        header = f"{'part':<17s} {'element':<12s} {'residual':>9s} {'limit':>9s}  {'':<8s}  worst at"
-        title = f"{verdict}: {self.states} states, {self.contacts} in contact"
-        return "\n".join([title, "", header, *map(str, shown)])
 
 
 def verify(
@@ -122,28 +47,32 @@ def verify(
     tolerance: float = 1e-8,
     seed: int = 0,
     observe: Callable[[Any], Any] | None = None,
+    memory: Mapping[str, Representation] | Remembered | None = None,
 ) -> VerifyReport:
     """Measure how far an environment is from the symmetry declared for it.
 
     The states are reached from resets by up to 50 random actions. From each of them and from its images
     the environment is stepped with random actions and their images. The identity is tested too: it fails
-    if something that decides the future is not part of the state. The parts, in the order of cause:
+    if something that decides the future is not part of the state, and the report then says "not tested"
+    before all else. The parts, in the order of cause:
 
     - ``"action box"``: K_g maps the bounds of the actions onto themselves, by entry;
     - ``"dynamics"``: one ``mj_step`` of the model with contact switched off, by joint;
     - ``"contact"``: one step of the environment with everything switched on, by joint; if this fails
       and ``"dynamics"`` does not, contact is to blame;
     - ``"kinematics"``: the observation of the image is the image of the observation, by entry;
-    - ``"reward"``, ``"termination"`` and ``"next observation"`` of that step;
+    - ``"reward"``, ``"termination"`` and ``"next observation"`` of that step, the last with what the
+      environment remembers then;
     - ``"rollout"``: the state after ``steps`` steps, by joint; reported, never a failure, since contact
       amplifies rounding;
     - ``"reset"``: Kolmogorov-Smirnov distance between mapped and other start observations, by entry.
 
     Args:
         env: a batched task environment (``reset_to``, ``task.transform_state``), a dm_control
-            ``Environment`` or a gymnasium ``MujocoEnv``. It is reset, seeded and stepped. Of the last two
-            only the state of MuJoCo is mapped, through :func:`~torchrl_sym.mujoco.derive`: a target
-            that the task keeps elsewhere, such as a moved geom, stays put and shows as a residual.
+            ``Environment`` or a gymnasium ``MujocoEnv``, these also inside TorchRL's wrappers. It is reset,
+            seeded and stepped. Of the last two the state of MuJoCo is mapped, through
+            :func:`~torchrl_sym.mujoco.derive`, and ``memory``: a target that the task keeps elsewhere,
+            such as a moved geom, stays put and shows as a residual.
         symmetry: representations of the observation's entries (``"observation"`` for an array) and of
             ``"action"``. If it is not strict, entries it does not declare are not tested.
         keyframe: symmetric pose for ``derive``. Defaults to ``qpos0``.
@@ -155,12 +84,15 @@ def verify(
         tolerance: largest relative residual that passes; 2e-6 for single-precision outputs.
         seed: seed of states and actions.
         observe: applied to every observation before it is compared, such as a normaliser.
+        memory: what the environment remembers beside the state of MuJoCo (last actions, a history, a
+            phase): attributes of it that hold arrays, with their representations; or
+            :class:`~torchrl_sym.mujoco.Remembered`, with functions that save and load.
 
     Raises:
-        TypeError: an environment of another kind.
-        KeyError: an observation, or the action, is not declared.
-        ValueError: a size differs from its representation's; a number out of its range; or a keyframe or
-            carried bodies for a task environment, which would ignore them.
+        TypeError: an environment of another kind, or memory that is no array.
+        KeyError: an observation, the action, or something remembered is not declared, or not there.
+        ValueError: a size or group differs from its representation's; a number out of its range; or a
+            keyframe, carried bodies or memory for a task environment, which would ignore them.
         SymmetryError: the model does not have the group, or a body cannot be carried by an element.
 
     Example:
@@ -168,14 +100,21 @@ def verify(
         >>> env = tasks.make_env("cartpole", num_envs=16, num_threads=1)
         >>> verify(env, env.symmetry).passed
         True
+
+        Of a gymnasium environment that observes its last two actions, as ``env.last`` and ``env.last2``::
+
+            verify(env, symmetry, memory={"last": robot.actuators, "last2": robot.actuators})
     """
     check_symmetry(symmetry)
+    kept = remembered(memory)
+    if kept is not None:
+        kept.check_group(symmetry.group)
     states, steps = (checks.whole(n, x, 1, MOST) for n, x in (("states", states), ("steps", steps)))
     tolerance = checks.real("tolerance", tolerance, 0.0)
     seed = checks.whole("seed", seed, 0, 2**32 - 1)  # what NumPy takes
     if observe is not None:
         checks.function("observe", observe)
-    subject = subject_of(env, symmetry, observe, Pose(keyframe, carried), seed)
+    subject = subject_of(env, symmetry, observe, Pose(keyframe, carried), seed, kept)
     if symmetry["action"].dim != len(subject.low):
         raise ValueError(
             f"'action': the environment takes {len(subject.low)} entries, its representation has "
@@ -275,6 +214,7 @@ class _Check:
             differ = getattr(one, flag) != getattr(other, flag)
             self.note("termination", element, float(differ.double().mean()), 0.0, flag, flag)
         self.observations("next observation", one.observation, other.observation, g)
+        self.memory("next observation", original.one, image.one, g)
 
     def limit(self, values: Tensor) -> float:
         single = values.dtype in (torch.float32, torch.float16, torch.bfloat16)
@@ -293,6 +233,15 @@ class _Check:
             limit = self.limit(value)
             where = _entries(str(key), residual, limit)
             self.note(part, self.group.names[g], residual.max(initial=0.0), limit, where, str(key))
+
+    def memory(self, part: str, original: Any, image: Any, g: int) -> None:
+        expected = getattr(self.subject.transform(original, g), "memory", {})
+        for name, value in expected.items():
+            one, other = (torch.as_tensor(x).reshape(1, -1) for x in (value, image.memory[name]))
+            residual, limit = _residual(one, other).max(axis=0), self.limit(one)
+            label = f"memory {name}"
+            where = _entries(label, residual, limit)
+            self.note(part, self.group.names[g], residual.max(initial=0.0), limit, where, label)
 
     def step_freely(self, state: Any, ctrl: Tensor) -> Any:
         """One ``mj_step`` without contact."""
