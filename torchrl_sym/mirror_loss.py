@@ -263,7 +263,7 @@ class MirrorLoss(LossModule):
     def in_keys(self) -> list[NestedKey]:
         """What the network reads."""
         if self._in_keys is None:
-            self._in_keys = inputs(self.actor_network)
+            self._in_keys = self.symmetry.together(inputs(self.actor_network))
         return self._in_keys
 
     @in_keys.setter
