@@ -24,6 +24,8 @@ from torchrl.envs import (
     RewardSum,
     SerialEnv,
     StepCounter,
+    Timer,
+    TrajCounter,
     Transform,
     TransformedEnv,
     UnsqueezeTransform,
@@ -144,7 +146,7 @@ def renamed(*transforms):
 PARTS = Symmetry(GROUP, {"velocity": polar(GROUP), "knees": KNEES})
 OFF = [0, 0.1, 0, 0, 0]
 RIGHT = {
-    "counters": lambda: robot(RewardSum(), StepCounter(), InitTracker()),
+    "counters": lambda: robot(RewardSum(), StepCounter(), InitTracker(), Timer(), TrajCounter()),
     "of the reward": lambda: robot(VecNormV2(["reward"]), VecNorm(["reward"])),
     "constants that commute": lambda: robot(norm([1, 0, 2, 0.5, 0.5], SPREAD)),
     "a factor": lambda: robot(ObservationNorm(loc=0.0, scale=2.0, in_keys=["observation"])),

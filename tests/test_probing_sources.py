@@ -70,3 +70,17 @@ def test_gymnasiums_own_normaliser():
     for env in (normalised(), SerialEnv(1, normalised)):
         with pytest.raises(ValueError, match=r"gymnasium's NormalizeObservation keeps statistics"):
             symmetry.check_specs(env)
+
+
+def test_entries_without_dimensions_of_their_own():
+    """As counters have, and sensors of one number: what is beside them is tried out all the same."""
+
+    class Clock(Robot):
+        def __init__(self):
+            super().__init__()
+            self.observation_spec["clock"] = Unbounded((2,))
+
+    symmetry = Symmetry(GROUP, {"observation": BODY, "action": KNEES}, strict=False)
+    symmetry.check_specs(TransformedEnv(Clock(), norm(0.0, 2.0)))
+    with pytest.raises(ValueError, match="ObservationNorm does not commute"):
+        symmetry.check_specs(TransformedEnv(Clock(), norm([0, 0.1, 0, 0, 0])))

@@ -109,7 +109,10 @@ class Symmetry(nn.Module):
             )
         names, representation = part
         if len(names) > 1:
-            raise KeyError(f"{key!r} has no representation of its own: {names} change places")
+            raise KeyError(
+                f"{key!r} has no representation of its own: {names} change places; where one is needed, "
+                "join them first (CatTensors) and declare what comes out"
+            )
         return representation
 
     def event_dims(self, key: NestedKey) -> int:
@@ -305,7 +308,7 @@ class Symmetry(nn.Module):
 
         Raises:
             KeyError: observations or actions of the environment are not declared (strict), but for those
-                that TorchRL's counters (StepCounter, RewardSum, InitTracker) write.
+                that TorchRL's counters (StepCounter, RewardSum, InitTracker, Timer, TrajCounter) write.
             ValueError: a size differs, a box is not symmetric, or a transform, such as a normaliser, does
                 not commute with L_g or K_g.
         """

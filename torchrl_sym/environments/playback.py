@@ -70,7 +70,7 @@ class Layout:
         """``(*B, dim)`` as entries in double precision."""
         batch = rows.shape[:-1]
         parts = zip(self.events.items(), rows.split(self.sizes, -1), strict=True)
-        entries = {key: part.reshape(*batch, *event) for (key, event), part in parts}
+        entries = {key: part.reshape((*batch, *event)) for (key, event), part in parts}
         return TensorDict({k: v for k, v in entries.items() if keys is None or k in keys}, batch)
 
     def cast(self, rows: Tensor) -> TensorDict:
@@ -110,7 +110,7 @@ def _draw(spec: TensorSpec, size: float) -> Tensor:
     free = torch.randn(spec.shape, dtype=torch.float64) * size
     if not isinstance(spec.space, ContinuousBox):
         return free
-    low, high, wide = _box(spec)
+    low, high, wide = _box(spec.space, spec.shape)
     within = low + torch.rand(spec.shape, dtype=torch.float64) * (high - low)
     return torch.where(wide, free.maximum(low).minimum(high), within)
 
@@ -120,13 +120,13 @@ def _opposite(spec: TensorSpec, value: Tensor) -> Tensor:
         return (value == 0).double()
     if not isinstance(spec.space, ContinuousBox):
         return -value
-    low, high, wide = _box(spec)
+    low, high, wide = _box(spec.space, spec.shape)
     return torch.where(wide, (-value).maximum(low).minimum(high), low + high - value)
 
 
-def _box(spec: TensorSpec) -> tuple[Tensor, Tensor, Tensor]:
+def _box(space: ContinuousBox, shape: torch.Size) -> tuple[Tensor, Tensor, Tensor]:
     """Bounds, and where they are so wide that they say nothing."""
-    low, high = (end.double().cpu().expand(spec.shape) for end in (spec.space.low, spec.space.high))
+    low, high = (bound.double().cpu().expand(shape) for bound in (space.low, space.high))
     return low, high, (high - low > 1e6) | ~(high - low).isfinite()
 
 

@@ -123,7 +123,9 @@ def _related(transforms: Sequence[Transform], keys: Sequence[NestedKey]) -> set[
 
 
 def _refuse_untried(transform: Transform, related: set[NestedKey]) -> None:
-    name = type(transform).__name__
+    name, keys = type(transform).__name__, {*transform.in_keys, *transform.out_keys}
+    if keys and not keys & related and not {*transform.in_keys_inv, *transform.out_keys_inv} & related:
+        return  # a counter, say
     _refuse_statistics(transform, related)
     warnings.warn(
         f"{name} cannot be tried out away from its environment: whether it commutes with the symmetry is "

@@ -8,7 +8,7 @@ import torch
 from tensordict import NestedKey
 from torchrl.data import Bounded, TensorSpec
 from torchrl.data.tensor_specs import ContinuousBox
-from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter
+from torchrl.envs import EnvBase, InitTracker, RewardSum, StepCounter, Timer, TrajCounter
 
 from torchrl_sym.declaration import check_events
 from torchrl_sym.entries import split
@@ -54,7 +54,7 @@ def counter_names(env: EnvBase) -> set[str]:
             names.add(transform.step_count_key)
         elif isinstance(transform, InitTracker):
             names.add(transform.init_key)
-        elif isinstance(transform, RewardSum):
+        elif isinstance(transform, RewardSum | Timer | TrajCounter):
             names |= {split(key)[1] for key in transform.out_keys}
     return names
 
