@@ -5,6 +5,8 @@ functions are not: the loss draws the parameters of several anew, and `MirrorLos
 coefficient is the paper's w: the loss sums over group elements, action entries and Q functions.
 """
 
+import sys
+
 import torch
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
@@ -14,6 +16,7 @@ from torchrl.objectives import SACLoss, SoftUpdate
 import tasks
 from torchrl_sym import MirrorLoss
 
+steps = int(sys.argv[1]) if len(sys.argv) > 1 else 100
 torch.manual_seed(0)
 env = tasks.make_env("cartpole", num_envs=64, num_threads=1, seed=0)
 
@@ -36,7 +39,7 @@ with torch.no_grad():
     batch = env.rollout(64, actor).reshape(-1)
 parameters = [p for p in objective.parameters() if p.requires_grad]  # the mirror losses have none
 optimizer = torch.optim.Adam(parameters, lr=3e-3)
-for step in range(101):
+for step in range(steps + 1):
     losses = objective(batch)
     of_actor, of_q = mirror(batch)["loss_mirror"], mirror_q(batch)["loss_mirror"]
     total = losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"] + of_actor + of_q
