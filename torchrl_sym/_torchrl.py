@@ -9,7 +9,6 @@ from tensordict import NestedKey
 from torchrl.data import ReplayBuffer, TensorDictReplayBuffer
 from torchrl.data.replay_buffers import SampleUnit, SliceSampler, Storage
 from torchrl.envs import EnvBase, SerialEnv, Transform, VecNormV2
-from torchrl.envs.common import _EnvWrapper
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.ppo import (
     _broadcast_advantage_to_log_weight as broadcast_advantage_to_log_weight,
@@ -90,4 +89,4 @@ def cuts_by(sampler: SliceSampler, key: NestedKey) -> bool:
 
 def wrapped_env(env: EnvBase) -> Any:
     """What a GymEnv, a DMControlEnv, ... wraps; the environment itself if it is TorchRL's own."""
-    return env._env if isinstance(env, _EnvWrapper) else env
+    return next(iter(wrappers_of(env)), env)

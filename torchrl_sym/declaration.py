@@ -7,6 +7,7 @@ the action, because an actor or an estimator wrote them beside it; and some are 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -20,6 +21,7 @@ from torchrl_sym.entries import (
     is_per_row,
     join,
     opposites,
+    path,
     split,
     uneven_keys,
     without_next,
@@ -118,8 +120,7 @@ class Declaration:
         parts: list[Part] = []
         unknown: list[NestedKey] = []
         done: set[NestedKey] = set()
-        for key in _leaves(batch, chosen):
-            value = batch.get(key, None)
+        for key, value in _leaves(batch, chosen):
             part = self.part(key)
             if value is None and part is None and not (is_per_row(key) or is_bookkeeping(key)):
                 unknown += [] if key in (followers or {}) else [key]  # misspelt, most likely
@@ -218,17 +219,17 @@ class Declaration:
         What belongs to an action by its name, or is in a group that has it: with the left and the right
         hand's action, ``left_log_prob`` or ``("left", "reward")`` become those of the right one.
         """
-        path = (*split(bare)[0], split(bare)[1])
+        own = path(bare)
         together = [position for position, (names, _) in enumerate(self.parts) if len(names) > 1]
         for position in sorted(together, key=lambda p: split(self.parts[p][0][0])[1] != "action"):
-            paths = [(*split(name)[0], split(name)[1]) for name in self.parts[position][0]]
+            paths = [path(name) for name in self.parts[position][0]]
             scores = [(*parts[:-1], f"{parts[-1]}_log_prob") for parts in paths]
-            if path in scores:
+            if own in scores:
                 return [unravel_key(other) for other in scores], position
             depth = next(k for k in range(1, 1 + max(map(len, paths))) if _distinct_at(paths, k))
             groups = [parts[:depth] for parts in paths]
-            if path[:depth] in groups:
-                return [unravel_key((*group, *path[depth:])) for group in groups], position
+            if own[:depth] in groups:
+                return [unravel_key((*group, *own[depth:])) for group in groups], position
         return None
 
     def _only_action(self) -> list[NestedKey]:
@@ -248,14 +249,14 @@ class Declaration:
                 )
 
 
-def _leaves(batch: TensorDictBase, chosen: Iterable[NestedKey]) -> Iterator[NestedKey]:
+def _leaves(batch: TensorDictBase, chosen: Iterable[NestedKey]) -> Iterator[tuple[NestedKey, Any]]:
     """Entries by their own keys: a network may read a group of them, as one of several agents does."""
     for key in chosen:
         value = batch.get(key, None)
         if isinstance(value, TensorDictBase):
-            yield from (unravel_key((key, leaf)) for leaf in value.keys(True, True))
+            yield from ((unravel_key((key, leaf)), each) for leaf, each in value.items(True, True))
         else:
-            yield key
+            yield key, value
 
 
 def require_even(batch: TensorDictBase) -> None:
@@ -272,11 +273,11 @@ def _as_spelled(key: NestedKey, names: list[NestedKey]) -> list[NestedKey]:
     """Names now, or under ``"next"`` as the key is."""
     if unravel_key(key) == without_next(key):
         return names
-    return [join(("next", *split(name)[0]), split(name)[1]) for name in names]
+    return [unravel_key(("next", name)) for name in names]
 
 
 def _distinct_at(paths: list[tuple[str, ...]], depth: int) -> bool:
-    return len({path[:depth] for path in paths}) == len(paths)
+    return len({names[:depth] for names in paths}) == len(paths)
 
 
 def _by_key(names: list[NestedKey], representation: Representation) -> Representation:

@@ -113,6 +113,12 @@ def join(parent: tuple[str, ...], leaf: str) -> NestedKey:
     return unravel_key((*parent, leaf))
 
 
+def path(key: NestedKey) -> tuple[str, ...]:
+    """The names on the way to an entry, its own last."""
+    parent, leaf = split(key)
+    return (*parent, leaf)
+
+
 def enclosing(key: NestedKey) -> list[NestedKey]:
     """The groups that an entry is in."""
     parent = split(key)[0]
@@ -124,9 +130,7 @@ def uneven_keys(tensordict: TensorDictBase, prefix: tuple[str, ...] = ()) -> lis
     if isinstance(tensordict, LazyStackedTensorDict):
         rows = [{unravel_key(key) for key in row.keys(True, True)} for row in tensordict.tensordicts]
         found = set().union(*rows).difference(set.intersection(*rows)) if rows else set()
-        return sorted(
-            (join(prefix, key) if isinstance(key, str) else (*prefix, *key) for key in found), key=str
-        )
+        return sorted((unravel_key((*prefix, key)) for key in found), key=str)
     uneven: list[NestedKey] = []
     for key, value in tensordict.items():
         if is_tensor_collection(value) and isinstance(value, TensorDictBase):
@@ -137,7 +141,7 @@ def uneven_keys(tensordict: TensorDictBase, prefix: tuple[str, ...] = ()) -> lis
 def opposites(keys: Iterable[NestedKey]) -> Iterable[tuple[NestedKey, NestedKey, int]]:
     """Pairs of keys that differ in a side, such as left and right, with the axis between the two."""
     keys = list(keys)
-    spelled = {tuple(part.lower() for part in (*split(key)[0], split(key)[1])): key for key in keys}
+    spelled = {tuple(part.lower() for part in path(key)): key for key in keys}
     for parts, key in spelled.items():
         for here, there, axis in _SIDES:
             other = tuple(_swapped(part, here, there) for part in parts)

@@ -280,7 +280,7 @@ def _modules(network: TensorDictModuleBase) -> list[TensorDictModuleBase]:
 
 
 def _is_reset(key: NestedKey) -> bool:
-    return (key if isinstance(key, str) else key[-1]) == "is_init"
+    return split(key)[1] == "is_init"
 
 
 def _distinct(keys: Iterable[NestedKey]) -> list[NestedKey]:

@@ -19,6 +19,7 @@ from torchrl.modules import (
     QValueModule,
 )
 
+from torchrl_sym.entries import split
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry
 
@@ -98,7 +99,7 @@ def is_q_function(network: TensorDictModule, keys: OutputKeys) -> bool:
     key = output_key(network, keys)
     if key == keys.action_value:
         return keys.action not in network.out_keys
-    reads = any(name == keys.action or _leaf(name) == "action" for name in network.in_keys)
+    reads = any(name == keys.action or split(name)[1] == "action" for name in network.in_keys)
     return key in (keys.state_action_value, keys.value) and reads
 
 
@@ -127,7 +128,3 @@ def deterministic_action(dist: distributions.Distribution) -> Tensor:
         )
     sample = getattr(dist, "deterministic_sample", None)
     return dist.mean if sample is None else sample
-
-
-def _leaf(key: NestedKey) -> str:
-    return key if isinstance(key, str) else str(key[-1])

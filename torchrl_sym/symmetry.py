@@ -313,15 +313,17 @@ class Symmetry(nn.Module):
                 not commute with L_g or K_g.
         """
         checks.instance("env", env, EnvBase)
-        counters = counter_names(env)
         unknown: list[NestedKey] = []
         for specs, is_action in ((env.observation_spec, False), (env.full_action_spec, True)):
             leaves: dict[NestedKey, TensorSpec] = dict(specs.items(True, True))  # pyright: ignore[reportAssignmentType]
-            unknown += [key for key in leaves if key not in self and split(key)[1] not in counters]
+            unknown += [key for key in leaves if key not in self]
             for names, representation in self._declaration.parts:
                 if any(name in leaves for name in names):
                     found = {name: leaves[name] for name in names if name in leaves}
                     check_part(names, found, env.batch_size, representation, bounded=is_action)
+        if unknown and self.strict:
+            counters = counter_names(env)  # which builds an environment, where workers are of processes
+            unknown = [key for key in unknown if split(key)[1] not in counters]
         if unknown and self.strict:
             raise KeyError(
                 f"the environment has {unknown}, which this symmetry does not know (it has {self.keys()}); "

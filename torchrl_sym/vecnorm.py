@@ -16,6 +16,7 @@ from torch import nn
 from torchrl.envs import VecNormV2
 
 from torchrl_sym import checks
+from torchrl_sym.entries import split
 from torchrl_sym.normalization import GroupAverage, working_dtype
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 
@@ -84,7 +85,7 @@ class SymmetricVecNorm(VecNormV2):
             eps=checks.real("eps", eps, above=0),
             reduce_batch_dims=checks.flag("reduce_batch_dims", reduce_batch_dims),
         )
-        rewards = [key for key in keys if key not in symmetry and _leaf(key) == "reward"]
+        rewards = [key for key in keys if key not in symmetry and split(key)[1] == "reward"]
         symmetry.require([key for key in keys if key not in rewards], type(self).__name__)
         self.averages = nn.ModuleList(
             GroupAverage(None if key in rewards else symmetry[key]) for key in keys
@@ -161,7 +162,3 @@ class SymmetricVecNorm(VecNormV2):
                 for old, new in zip(exact, moved, strict=True)
             )
         return self
-
-
-def _leaf(key: NestedKey) -> str:
-    return key if isinstance(key, str) else str(key[-1])

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from torchrl_sym.normalization import SymmetricNorm
+from torchrl_sym.normalization import GroupAverage, SymmetricNorm
 
 _LEAST_STD = 1e-8  # of a return: a task that has paid nothing yet
 
@@ -55,6 +55,7 @@ class RewardScale(nn.Module):
     def __init__(self, num_envs: int, gamma: float) -> None:
         super().__init__()
         self.gamma = gamma
+        self.average = GroupAverage(None)  # no element changes a return
         self.register_buffer("running", torch.zeros(num_envs, dtype=torch.float64))
         self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
         self.register_buffer("var", torch.zeros((), dtype=torch.float64))
@@ -78,6 +79,4 @@ class RewardScale(nn.Module):
     def _add(self, returns: Tensor) -> None:
         self.count += returns.numel()
         weight = returns.numel() / self.count.double()
-        step = returns.mean() - self.mean
-        self.mean += weight * step
-        self.var.add_(weight * step**2).mul_(1 - weight).add_(weight * returns.var(correction=0))
+        self.average.merge(self.mean, self.var, returns.flatten(), weight)
