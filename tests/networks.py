@@ -28,6 +28,17 @@ GROUPS = {
 SYMMETRIC = ["C2", "K4", "C3", "D3"]
 
 
+class CatInputs(nn.Module):
+    """A network of an observation and an action side by side, as Q functions are."""
+
+    def __init__(self, net):
+        super().__init__()
+        self.net = net
+
+    def forward(self, observation, action):
+        return self.net(torch.cat([observation, action], -1))
+
+
 def make_symmetry(
     group: str = "C2", observation: NestedKey = "observation", action: NestedKey = "action"
 ) -> Symmetry:

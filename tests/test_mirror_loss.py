@@ -16,6 +16,7 @@ from tests.networks import (
     ACTION_DIM,
     OBSERVATION_DIM,
     SYMMETRIC,
+    CatInputs,
     add_transitions,
     assert_unchanged,
     gradients,
@@ -218,15 +219,6 @@ def test_adds_its_gradient_to_sac():
     both = torch.autograd.grad(both, list(actor.parameters()))
     expected = alone + gradients(mirror, batch, [actor])
     torch.testing.assert_close(torch.cat([g.flatten() for g in both]), expected)
-
-
-class CatInputs(nn.Module):
-    def __init__(self, net):
-        super().__init__()
-        self.net = net
-
-    def forward(self, observation, action):
-        return self.net(torch.cat([observation, action], -1))
 
 
 def test_is_a_metric_under_no_grad():

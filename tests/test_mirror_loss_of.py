@@ -37,7 +37,7 @@ from torchrl.objectives import (
     TQCLoss,
 )
 
-from tests.networks import ACTION_DIM, GROUPS, OBSERVATION_DIM, make_symmetry
+from tests.networks import ACTION_DIM, GROUPS, OBSERVATION_DIM, CatInputs, make_symmetry
 from torchrl_sym import MirrorLoss, SymmetricClipPPOLoss, Symmetry
 from torchrl_sym.representations import permutation
 
@@ -92,15 +92,6 @@ def action_values():
 
 def arg_max():
     return QValueActor(mlp(OBSERVATION_DIM, 4), in_keys=STATE, spec=OneHot(4))
-
-
-class CatInputs(nn.Module):
-    def __init__(self, net):
-        super().__init__()
-        self.net = net
-
-    def forward(self, observation, action):
-        return self.net(torch.cat([observation, action], -1))
 
 
 def ppo(**kwargs):
