@@ -138,7 +138,7 @@ def on_the_edge(phase):
 
 @pytest.mark.parametrize("phase", ["A", "C"])
 def test_verify_passes_while_the_robot_stands_on_the_edge_of_the_box(phase, monkeypatch):
-    monkeypatch.setattr(sys.modules["torchrl_sym.mujoco.verify"], "MAX_WARM_UP", 0)
+    monkeypatch.setattr(sys.modules["torchrl_sym.mujoco.verify.verify"], "MAX_WARM_UP", 0)
     task, state = on_the_edge(phase)
     assert len(state) >= 16
     tilt = rotation(state)[:, 2, :2].norm(dim=-1)

@@ -223,7 +223,7 @@ def pushing_states():
 
 
 def test_verify_passes_while_the_robot_pushes_the_cube(monkeypatch):
-    monkeypatch.setattr(sys.modules["torchrl_sym.mujoco.verify"], "MAX_WARM_UP", 0)
+    monkeypatch.setattr(sys.modules["torchrl_sym.mujoco.verify.verify"], "MAX_WARM_UP", 0)
     task, state = pushing_states()
     assert len(state) >= 10
     assert (state.qvel[:, 19:21].norm(dim=-1) > 0.05).any(), "the cube moves"

@@ -9,7 +9,7 @@ import torch
 
 from torchrl_sym import PointGroup
 from torchrl_sym.mujoco import audit, derive
-from torchrl_sym.mujoco.contacts import colliding_geoms
+from torchrl_sym.mujoco.audit.contacts import colliding_geoms
 
 MIRROR = PointGroup.reflection("y")
 NATIVE, LIBCCD = "", '<flag nativeccd="disable"/>'

@@ -16,7 +16,7 @@ from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.audit import audit
 from torchrl_sym.mujoco.derive import derive
-from torchrl_sym.mujoco.links import mj
+from torchrl_sym.mujoco.model.types import mj
 from torchrl_sym.mujoco.symmetrize import symmetrize_with_report
 
 GROUPS = {

@@ -1,114 +1,21 @@
-"""Images of sites, tendons and actuators: what hangs on links and joints.
+"""Images of actuators, which are mapped by their transmission.
 
-A site is mapped by its place on the link. A tendon is mapped by what it couples: a fixed tendon by its
-joint coefficients (up to a common sign), a spatial one by its path (in either direction). An actuator is
-mapped by its transmission; its sign says whether the image pushes the other way.
+The sign says whether the image pushes the other way.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from torchrl_sym.mujoco.coordinates import CoordinateMap
-from torchrl_sym.mujoco.links import BALL, FREE, Array, Matcher, MjData, MjModel, mj, name_of
+from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
+from torchrl_sym.mujoco.derive.images import Image, SymmetryError
+from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.types import BALL, FREE, Array, MjModel, mj, name_of
 
 _TRANSMISSION = {
     int(getattr(mj.mjtTrn, f"mjTRN_{name.upper()}")): name
     for name in ("joint", "jointinparent", "tendon", "site", "body")
 }
-_WRAP = mj.mjtWrap
-
-
-class SymmetryError(ValueError):
-    """The model does not have the requested symmetry, not even nearly; the message says why."""
-
-
-@dataclass
-class Image:
-    """Where an element goes: the index of its image, a sign, and an offset of its coordinate."""
-
-    index: int
-    sign: float = 1.0
-    offset: float = 0.0
-
-
-def map_sites(
-    model: MjModel, data: MjData, matcher: Matcher, bodies: dict[int, int], tolerance: float
-) -> dict[int, int]:
-    """Image of every site that has one: on the image link, where R sends it."""
-    images: dict[int, int] = {}
-    owner = model.body_weldid[model.site_bodyid]
-    for a, b in bodies.items():
-        mine, theirs = np.flatnonzero(owner == a), np.flatnonzero(owner == b)
-        if not len(mine) or not len(theirs):
-            continue
-        moved = data.site_xpos[mine] @ matcher.matrix.T
-        cost = np.linalg.norm(moved[:, None] - matcher.image.site_xpos[theirs], axis=-1) / matcher.extent
-        # sites in one place are told apart by their size and by staying where they are
-        sizes = np.abs(model.site_size[mine][:, None] - model.site_size[theirs]).sum(-1)
-        cost = cost + 1e-3 * sizes / matcher.extent + 1e-9 * (mine[:, None] != theirs)
-        for r, c in zip(*linear_sum_assignment(cost), strict=True):
-            if cost[r, c] <= tolerance:
-                images[int(mine[r])] = int(theirs[c])
-    return images
-
-
-def map_tendons(model: MjModel, map_: CoordinateMap, sites: dict[int, int]) -> dict[int, Image]:
-    """Image of every tendon, with the sign of its length.
-
-    Raises:
-        SymmetryError: a tendon couples joints or sites whose images no tendon couples.
-    """
-    contents = [_tendon(model, t) for t in range(model.ntendon)]
-    images = {}
-    for t, (kind, parts) in enumerate(contents):
-        if kind == "fixed":
-            moved = {map_.joints[j]: map_.signs[j] * c for j, c in parts}
-            candidates = [(dict(other), s) for _, other in contents for s in (1.0, -1.0)]
-            hits = [
-                Image(i // 2, sign)
-                for i, (other, sign) in enumerate(candidates)
-                if contents[i // 2][0] == "fixed"
-                and other.keys() == moved.keys()
-                and all(abs(moved[j] - sign * other[j]) < 1e-6 for j in moved)
-            ]
-        else:
-            path = [(w, sites.get(o) if w == "site" else None) for w, o in parts]
-            hits = [
-                Image(i)
-                for i, (other_kind, other) in enumerate(contents)
-                if other_kind == "spatial" and _same_path(path, other)
-            ]
-        if not hits:
-            raise SymmetryError(
-                f"{name_of(model, 'tendon', t)} has no image: no tendon couples the images of what it "
-                "couples; add the missing tendon, or use a smaller group"
-            )
-        images[t] = next((hit for hit in hits if hit.index == t), hits[0])
-    return images
-
-
-def _tendon(model: MjModel, t: int) -> tuple[str, list[tuple]]:
-    start, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
-    kinds, objects = model.wrap_type[start : start + count], model.wrap_objid[start : start + count]
-    if kinds[0] == int(_WRAP.mjWRAP_JOINT):
-        coefficients = model.wrap_prm[start : start + count]
-        return "fixed", [(int(j), float(c)) for j, c in zip(objects, coefficients, strict=True)]
-    names = {int(_WRAP.mjWRAP_SITE): "site", int(_WRAP.mjWRAP_PULLEY): "pulley"}
-    return "spatial", [(names.get(int(k), "geom"), int(o)) for k, o in zip(kinds, objects, strict=True)]
-
-
-def _same_path(path: list[tuple], other: list[tuple]) -> bool:
-    def equal(a: list[tuple], b: list[tuple]) -> bool:
-        # wrapping geoms are compared by their place in the path only; the audit compares their shapes
-        return len(a) == len(b) and all(
-            x[0] == y[0] and (x[0] != "site" or x[1] == y[1]) for x, y in zip(a, b, strict=True)
-        )
-
-    return equal(path, other) or equal(path[::-1], other)
 
 
 def map_actuators(

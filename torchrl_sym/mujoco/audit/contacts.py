@@ -15,8 +15,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_sym.mujoco.geoms import touching
-from torchrl_sym.mujoco.links import MjModel, mj, name_of
+from torchrl_sym.mujoco.model.shapes import touching
+from torchrl_sym.mujoco.model.types import MjModel, mj, name_of
 
 _GEOM, _DISABLE = mj.mjtGeom, mj.mjtDisableBit
 _KINDS = {

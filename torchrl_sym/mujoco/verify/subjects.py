@@ -20,8 +20,8 @@ from torchrl.envs import EnvBase
 
 from torchrl_sym._torchrl import wrapped_env
 from torchrl_sym.mujoco.derive import derive
-from torchrl_sym.mujoco.links import MjModel, mj
-from torchrl_sym.mujoco.remembered import Remembered
+from torchrl_sym.mujoco.model.types import MjModel, mj
+from torchrl_sym.mujoco.verify.remembered import Remembered
 from torchrl_sym.symmetry import Symmetry
 
 Observation: TypeAlias = dict[NestedKey, Tensor]

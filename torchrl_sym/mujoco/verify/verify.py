@@ -22,10 +22,10 @@ from scipy import stats
 from torch import Tensor
 
 from torchrl_sym import checks
-from torchrl_sym.mujoco.links import BALL, FREE, Array, MjModel, mj, name_of
-from torchrl_sym.mujoco.remembered import Remembered, remembered
-from torchrl_sym.mujoco.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
-from torchrl_sym.mujoco.verify_report import PARTS, VerifyReport, VerifyRow
+from torchrl_sym.mujoco.model.types import BALL, FREE, Array, MjModel, mj, name_of
+from torchrl_sym.mujoco.verify.remembered import Remembered, remembered
+from torchrl_sym.mujoco.verify.report import PARTS, VerifyReport, VerifyRow
+from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Pose, Subject, subject_of, write_state
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry, check_symmetry
 

@@ -1,0 +1,49 @@
+"""Masses and inertias of links, and the drag of a fluid on them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from torchrl_sym.mujoco.audit.comparison import Comparison
+from torchrl_sym.mujoco.model.types import name_of
+
+
+def compare_links(c: Comparison) -> None:
+    """Masses, centres of mass, inertias and gravity compensation."""
+    model, turn = c.model, c.matcher.matrix
+    moving = [link for body, link in c.links.items() if body]  # the world's own mass does not matter
+    total = max(sum(link.mass for link in moving), 1e-12)
+    largest = max([float(np.abs(link.inertia).max()) for link in moving] + [1e-12])
+    for a, b in c.map.bodies.items():
+        if a == 0:
+            continue
+        one, other, name = c.links[a], c.image_links[b], c.name("body", a, b)
+        c.add("mass", abs(one.mass - other.mass) / total, name)
+        if min(one.mass, other.mass) > 0:
+            offset = float(np.linalg.norm(turn @ one.com - other.com))
+            c.add("centre of mass", offset / c.matcher.extent, name)
+        image = turn @ one.inertia @ turn.T
+        c.add("inertia", float(np.abs(image - other.inertia).max()) / largest, name)
+        if model.body_gravcomp.any():
+            lift = [model.body_mass[x.bodies] @ model.body_gravcomp[x.bodies] for x in (one, other)]
+            c.add("gravity compensation", abs(float(lift[0] - lift[1])) / total, name)
+
+
+def compare_fluid(c: Comparison) -> None:
+    """Drag acts on each body's inertia box, so that its axes matter, and wind."""
+    model, turn = c.model, c.matcher.matrix
+    if not (model.opt.density > 0 or model.opt.viscosity > 0):
+        return
+    wind = model.opt.wind
+    if wind.any():
+        gap = float(np.linalg.norm(turn @ wind - wind) / np.linalg.norm(wind))
+        c.add("wind", min(gap, 1.0), "wind")
+    for a, b in c.map.bodies.items():
+        one, other = ([x for x in c.links[k].bodies if model.body_mass[x] > 0] for k in (a, b))
+        if a and len(one) == len(other) == 1:
+            ends = ((c.data, one), (c.image, other))
+            axes = [pose.ximat[body[0]].reshape(3, 3) for pose, body in ends]
+            turned = axes[1].T @ turn @ axes[0]
+            c.add("drag", float(np.abs(turned - turned.round()).max()), c.name("body", a, b))
+        elif a and one:
+            c.unchecked.append(f"drag on {name_of(model, 'body', a)!r}, a link of several bodies")

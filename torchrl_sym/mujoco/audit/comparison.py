@@ -1,0 +1,79 @@
+"""Residuals of numbers that a symmetry maps onto each other, made relative."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
+from torchrl_sym.mujoco.model.links import links_of
+from torchrl_sym.mujoco.model.types import Array, name_of
+
+
+class Comparison:
+    """Compares everything in a model with its image under one element; ``worst`` holds the outcome."""
+
+    def __init__(self, symmetry: ModelSymmetry, g: int) -> None:
+        self.model, self.action = symmetry.model, symmetry.actions[g]
+        self.matcher = self.action.matcher
+        self.data, self.image = self.matcher.data, self.matcher.image
+        self.links = self.matcher.links
+        self.image_links = links_of(self.model, self.image)
+        self.map = self.action.coordinates
+        self.worst: dict[str, tuple[float, str]] = {}
+        self.unchecked: list[str] = []
+
+    def add(self, term: str, residual: float, name: str) -> None:
+        """Keep the worst part of each term."""
+        if term not in self.worst or residual > self.worst[term][0]:
+            self.worst[term] = (residual, name)
+
+    def name(self, kind: str, a: int, b: int) -> str:
+        name = name_of(self.model, kind, a)
+        return name if a == b else f"{name} -> {name_of(self.model, kind, b)}"
+
+    def range(
+        self,
+        term: str,
+        field: str,
+        limited: str | None,
+        i: int,
+        j: int,
+        sign: float,
+        shift: float,
+        name: str,
+    ) -> None:
+        """An interval goes to ``sign * interval + shift``; compared relative to its width."""
+        model = self.model
+        flags = [bool(getattr(model, limited)[k]) if limited else True for k in (i, j)]
+        if flags[0] != flags[1]:
+            self.add(term, 1.0, f"{name} (only one is limited)")
+        elif flags[0]:
+            one, other = getattr(model, field)[i], getattr(model, field)[j]
+            image = np.sort(sign * one + shift)
+            scale = max(np.ptp(one), np.ptp(other)) or np.abs(other).max() or 1.0
+            self.add(term, float(np.abs(image - other).max()) / scale, name)
+
+    def fields(
+        self, term: str, fields: list[str], i: int, j: int, name: str, alike: NDArray[np.intp] | None = None
+    ) -> None:
+        """Model fields that must be equal, relative to the largest among elements of like units."""
+        for field in fields:
+            values = np.asarray(getattr(self.model, field), dtype=float)
+            if not values.any():
+                continue
+            self.values(term, values.reshape(len(values), -1), i, j, name, alike)
+
+    def values(
+        self, term: str, values: Array, i: int, j: int, name: str, alike: NDArray[np.intp] | None = None
+    ) -> None:
+        scale = column_scale(values if alike is None else values[alike])
+        self.add(term, float((np.abs(values[i] - values[j]) / scale).max(initial=0.0)), name)
+
+
+def column_scale(values: Array) -> Array:
+    """Largest magnitude in each column, 1 for a column of zeros."""
+    if not len(values):
+        return np.ones(values.shape[1:])
+    scale = np.abs(values).max(axis=0)
+    return np.where(scale > 0, scale, 1.0)

@@ -1,0 +1,1 @@
+"""Reading a compiled model: its parts, rigid links, poses, rotations and shapes."""
