@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import abc
+import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -13,7 +15,8 @@ from torch import Tensor
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.model.types import MjModel, mj
-from torchrl_sym.mujoco.verify.poses import TRIES, random_pose, reach_contact
+from torchrl_sym.mujoco.verify.forces import Disturbances
+from torchrl_sym.mujoco.verify.poses import KINDS, TRIES, random_pose, reach_contact
 from torchrl_sym.mujoco.verify.remembered import Remembered
 from torchrl_sym.mujoco.verify.states import PhysicsState, image_of, read_state, write_state
 from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Pose, Subject
@@ -62,12 +65,23 @@ class PhysicsSubject(Subject):
         mj.mj_forward(self.model, data)
         mj.mj_rnePostConstraint(self.model, data)  # contact forces, which some observe
         data.qacc_warmstart[:] = state.qacc_warmstart[0].numpy()  # mj_forward replaced it
+        Disturbances.add(data, state.added)
         if self.memory:
             self.memory.write(self.owner, state.memory)
 
     def transform(self, state: PhysicsState, g: int) -> PhysicsState:
         memory = self.memory.image(state.memory, g) if self.memory else {}
-        return image_of(self.robot, state, g, memory)
+        added = self.disturbances.image(state.added, g) if state.added else {}
+        return image_of(self.robot, state, g, memory, added)
+
+    @functools.cached_property
+    def disturbances(self) -> Disturbances:
+        """What may be added to forces and readings."""
+        pose = random_pose(self.model, self.state(), torch.Generator().manual_seed(0), KINDS - 1)
+        return Disturbances(self.robot, pose, self.transform)
+
+    def disturb(self, state: PhysicsState, generator: torch.Generator) -> PhysicsState:
+        return dataclasses.replace(state, added=self.disturbances.draw(generator))
 
     def map_ctrl(self, ctrl: Tensor, g: int) -> Tensor | None:
         return self.robot.map_ctrl(ctrl, g) if self.model.nu else None

@@ -17,7 +17,10 @@ _FIELDS = ("qpos", "qvel", "mocap_pos", "mocap_quat", "act", "ctrl", "qacc_warms
 
 @dataclass
 class PhysicsState:
-    """State of one MuJoCo simulation as tensors with one row, and what its environment remembers beside."""
+    """State of one MuJoCo simulation as tensors with one row, and what its environment remembers beside.
+
+    ``added`` is added to what MuJoCo computes, by field, before anything is observed.
+    """
 
     qpos: Tensor
     qvel: Tensor
@@ -28,6 +31,7 @@ class PhysicsState:
     qacc_warmstart: Tensor
     time: float
     memory: dict[str, Any] = field(default_factory=dict)
+    added: dict[str, Tensor] = field(default_factory=dict)
 
     def rows(self, ids: slice) -> PhysicsState:
         """A copy."""
@@ -50,8 +54,10 @@ def write_state(data: MjData, state: Any, row: int = 0) -> None:
     data.time = float(torch.as_tensor(state.time).reshape(-1)[row])
 
 
-def image_of(robot: ModelSymmetry, state: PhysicsState, g: int, memory: dict[str, Any]) -> PhysicsState:
-    """Image of a state under one element, with that of its memory."""
+def image_of(
+    robot: ModelSymmetry, state: PhysicsState, g: int, memory: dict[str, Any], added: dict[str, Tensor]
+) -> PhysicsState:
+    """Image of a state under one element, with those of its memory and of what is added."""
     model = robot.model
     position, rotation = state.mocap_pos, state.mocap_quat
     if model.nmocap:
@@ -66,6 +72,7 @@ def image_of(robot: ModelSymmetry, state: PhysicsState, g: int, memory: dict[str
         qacc_warmstart=robot.map_qvel(state.qacc_warmstart, g),
         time=state.time,
         memory=memory,
+        added=added,
     )
 
 

@@ -100,6 +100,10 @@ class Subject(abc.ABC):
         """Another state to begin in; this one, where starts are varied enough."""
         return state
 
+    def disturb(self, state: Any, generator: torch.Generator) -> Any:
+        """The same state, observed as if there were other contact forces, if they can be had."""
+        return state
+
     def touching(self, generator: torch.Generator) -> Any | None:
         """A state in which something touches, if one is easily found."""
         return None
