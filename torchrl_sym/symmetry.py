@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_sym import checks
+from torchrl_sym import checks, printing
 from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, enclosing, split, without_next
@@ -330,6 +330,35 @@ class Symmetry(nn.Module):
                 "add their representations, e.g. invariant(group, d) for what no element changes"
             )
         check_transforms(env, Declared(self.keys(), self, self.group.names))
+
+    def code(self) -> str:
+        """The declaration of this symmetry as a person would write it: Python, to be pasted and reviewed.
+
+        ``print(symmetry)`` lists every entry instead.
+
+        Example:
+            >>> from torchrl_sym.representations import axial, polar
+            >>> group = PointGroup.reflection("y")
+            >>> print(Symmetry(group, {"velocity": polar(group) + axial(group)}).code())
+            from torchrl_sym import PointGroup, Symmetry
+            from torchrl_sym.representations import axial, polar
+            <BLANKLINE>
+            group = PointGroup.reflection("y")
+            <BLANKLINE>
+            symmetry = Symmetry(
+                group,
+                {
+                    "velocity": (
+                        polar(group)  # 0-2
+                        + axial(group)  # 3-5
+                    ),
+                },
+            )
+        """
+        return printing.code(self.group, self._declaration.parts, self.strict)
+
+    def __str__(self) -> str:
+        return printing.table(self.group, self._declaration.parts)
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self.keys()}"

@@ -1,12 +1,14 @@
-"""Symmetry of MuJoCo models: derive it, audit it, symmetrize it, verify it."""
+"""Symmetry of MuJoCo models: derive it, audit it, symmetrize it, verify it, infer that of observations."""
 
 from torchrl_sym.mujoco.audit import AuditReport, audit
 from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
+from torchrl_sym.mujoco.infer import InferenceError, infer
 from torchrl_sym.mujoco.symmetrize import SymmetrizeReport, symmetrize, symmetrize_with_report
 from torchrl_sym.mujoco.verify import Remembered, VerifyReport, verify
 
 __all__ = [
     "AuditReport",
+    "InferenceError",
     "ModelSymmetry",
     "Remembered",
     "SymmetrizeReport",
@@ -14,6 +16,7 @@ __all__ = [
     "VerifyReport",
     "audit",
     "derive",
+    "infer",
     "symmetrize",
     "symmetrize_with_report",
     "verify",

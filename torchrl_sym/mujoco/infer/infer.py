@@ -17,7 +17,8 @@ from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.mujoco.infer.actions import ActionFinder
 from torchrl_sym.mujoco.infer.errors import InferenceError
 from torchrl_sym.mujoco.infer.inferred import InferredSymmetry
-from torchrl_sym.mujoco.infer.observations import ObservationFinder, ranges
+from torchrl_sym.mujoco.infer.observations import ObservationFinder
+from torchrl_sym.mujoco.infer.refusal import notes_on, ranges, refuse
 from torchrl_sym.mujoco.infer.samples import Sampler
 from torchrl_sym.mujoco.verify.recognition import subject_of
 from torchrl_sym.mujoco.verify.remembered import Remembered, remembered
@@ -38,7 +39,7 @@ def infer(
     observe: Callable[[Any], Any] | None = None,
     samples: int = 96,
     seed: int = 0,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-4,
 ) -> InferredSymmetry:
     """How an environment's observation and action transform under a group.
 
@@ -96,10 +97,12 @@ def infer(
     actions = ActionFinder(subject, group, generator)
     action = actions.find()
     observations = ObservationFinder(Sampler(subject, action, generator), group, tolerance)
-    found = {**observations.find(samples), "action": action}
+    observations.find(samples)
+    refuse(observations)
+    found = {**observations.representations(), "action": action}
     _check_faithful(group, found.values())
 
-    notes = list(observations.notes)
+    notes = notes_on(observations)
     if actions.still:
         notes.append(f"action {ranges(actions.still)} moves nothing that was tried: stays as it is")
     labels = {**observations.labels, "action": actions.labels()}

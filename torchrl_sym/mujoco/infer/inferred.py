@@ -46,4 +46,4 @@ class InferredSymmetry(Symmetry):
 
     def code(self) -> str:
         """The declaration of this symmetry as a person would write it, to be pasted and reviewed."""
-        return code(self.group, self._declaration.parts, self.labels)
+        return code(self.group, self._declaration.parts, labels=self.labels)

@@ -15,7 +15,7 @@ from torchrl_sym.mujoco.model.types import Array
 
 _ROOTS = np.sqrt([0.0, 0.25, 0.5, 0.75, 1.0])  # sines of the angles that most groups turn by
 _SNAP = 1e-5  # distance from one of them that is taken for noise
-_INDEPENDENT = 1e-7  # smallest singular value, of columns of unit length
+_INDEPENDENT = 1e-4  # smallest singular value, of columns of unit length
 _WINDOWS = (2, 3, 4, 6, 9)  # entries of planar vectors, vectors, quaternions, two of them, rotations
 
 

@@ -10,17 +10,17 @@ from tensordict import NestedKey
 
 from torchrl_sym.entries import Exchanged
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.infer.errors import InferenceError, Unexplained
-from torchrl_sym.mujoco.infer.quantities import labels_of
-from torchrl_sym.mujoco.infer.reasons import reason_of
+from torchrl_sym.mujoco.infer.errors import InferenceError
+from torchrl_sym.mujoco.infer.quantities import labels_of, names_of
 from torchrl_sym.mujoco.infer.samples import Sampler, Samples
 from torchrl_sym.mujoco.infer.solve import Solution, solve
 from torchrl_sym.mujoco.model.types import Array
-from torchrl_sym.mujoco.verify.poses import can_touch
 from torchrl_sym.representations import Representation
+from torchrl_sym.representations.blocks import SignedPermutation
 
-_SINGLE = 4e-6  # what single precision rounds, relative to the entry
+_SINGLE, _DOUBLE = 4e-6, 1e-10  # what single and double precision round, relative to the entry
 _FEW = 4  # samples in which an entry must differ, to be told from others that agree with it
+_ROUNDS = 5  # how often samples are drawn, where that may help: each time as many as there are
 
 Keys = tuple[NestedKey, ...]
 
@@ -29,193 +29,136 @@ class ObservationFinder:
     """Finds how every key of an observation transforms.
 
     Attributes:
+        samples: what was observed.
+        solutions: what was found, by the keys that change places.
         labels: what the entries of each key seem to be.
-        notes: what to know of the result.
     """
 
     def __init__(self, sampler: Sampler, group: PointGroup, tolerance: float) -> None:
         self.sampler, self.group, self.tolerance = sampler, group, tolerance
+        self.samples: Samples = sampler.samples
+        self.solutions: dict[Keys, Solution] = {}
         self.labels: dict[NestedKey, list[str]] = {}
-        self.notes: list[str] = []
 
-    def find(self, count: int) -> dict[NestedKey | Exchanged, Representation]:
-        """Representations by key, or by keys that change places.
+    def find(self, count: int) -> None:
+        """Draw samples until all is clear, or no more becomes so.
 
-        Raises:
-            InferenceError: as `infer` says.
+        What is found from some samples is checked on others; where these are a surprise, it is found anew
+        from all, and checked on as many more.
         """
-        samples = self.sampler.draw(count)
-        self._check_kinds(samples)
-        solutions = self._solutions(samples)
-        settled = all(
-            s.complete and not s.constant.any() and not self._unclear(s) for s in solutions.values()
-        )
-        if not settled:  # look further
-            self.sampler.draw(count)
-            samples = self.sampler.draw_patiently()
-            solutions = self._solutions(samples)
-        self._label(samples)
-        found = self._representations(solutions, samples)
-        self._refuse(solutions, samples, found)
-        self._note(solutions, samples)
-        return found
+        self.samples = self.sampler.draw(count)
+        self._check_kinds()
+        known = 2 * self.samples.count // 3
+        for number in range(_ROUNDS):
+            self.solutions = self._solutions(known)
+            found = self.solutions.values()
+            still = any(s.constant.any() for s in found) and number == 0
+            if not still and not any(s.surprised.any() or unclear(s) for s in found):
+                break
+            known = self.samples.count
+            self.sampler.draw(known)
+            if number == 0:
+                self.sampler.draw_patiently()
+        names, quantities = names_of(self.sampler.subject), self.samples.quantities
+        assert quantities is not None
+        for key, x in self.samples.values.items():
+            labels = labels_of(names, quantities.numpy(), x[0].numpy(), self.rounding(key))
+            self.labels[key] = labels
 
-    def _margin(self, samples: Samples, key: NestedKey) -> Array:
-        """Largest difference of each entry that counts as none."""
-        size = samples.values[key].abs().amax(dim=(0, 1)).numpy()
-        single = samples.dtypes[key] in (torch.float32, torch.float16, torch.bfloat16)
-        return (max(self.tolerance, _SINGLE) if single else self.tolerance) * np.maximum(size, 1e-6)
+    def margin(self, key: NestedKey) -> Array:
+        """Largest difference of each entry from its image that counts as none."""
+        return np.maximum(self.tolerance * self.size(key), self.rounding(key))
 
-    def _check_kinds(self, samples: Samples) -> None:
-        for key, shape in samples.shapes.items():
-            if samples.dtypes[key] == torch.uint8 and len(shape) > 1:
+    def rounding(self, key: NestedKey) -> Array:
+        """Largest difference of each entry that is no more than rounding."""
+        single = self.samples.dtypes[key] in (torch.float32, torch.float16, torch.bfloat16)
+        return (_SINGLE if single else _DOUBLE) * self.size(key)
+
+    def size(self, key: NestedKey) -> Array:
+        """Largest value of each entry."""
+        return np.maximum(self.samples.values[key].abs().amax(dim=(0, 1)).numpy(), 1e-6)
+
+    def hidden(self, key: NestedKey) -> Array:
+        """Entries that differ between two observations of one state, ``(d,)`` bool."""
+        return self.samples.hidden[key].numpy() > self.margin(key)
+
+    def _check_kinds(self) -> None:
+        for key, shape in self.samples.shapes.items():
+            if self.samples.dtypes[key] == torch.uint8 and len(shape) > 1:
                 raise InferenceError(
                     f"{key!r}: expected numbers of a state, got an image {tuple(shape)}; leave it out with "
                     "observe=..., and declare it with torchrl_sym.representations.image"
                 )
 
-    def _solutions(self, samples: Samples) -> dict[Keys, Solution]:
+    def _solutions(self, known: int) -> dict[Keys, Solution]:
         """One for each key; those of keys that have none by themselves together, if that helps."""
-        found = {(key,): self._solve(samples, (key,)) for key in samples.values}
+        found = {(key,): self._solve((key,), known) for key in self.samples.values}
         alone = [keys for keys, solution in found.items() if not solution.complete]
         if len(alone) < 2:
             return found
         together = tuple(key for keys in alone for key in keys)
-        joint = self._solve(samples, together)
-        for keys in _exchanged(joint, [samples.values[key].shape[-1] for key in together], together):
-            if len(keys) > 1 and (part := self._solve(samples, keys)).complete:
+        joint = self._solve(together, known)
+        for keys in _exchanged(joint, [self.samples.values[key].shape[-1] for key in together], together):
+            if len(keys) > 1 and (part := self._solve(keys, known)).complete:
                 for key in keys:
                     del found[key,]
                 found[keys] = part
         return found
 
-    def _solve(self, samples: Samples, keys: Keys) -> Solution:
-        """From two thirds of the samples, checked on the rest."""
-        values = torch.cat([samples.values[key] for key in keys], -1).numpy()
-        margin = np.concatenate([self._margin(samples, key) for key in keys])
-        held_out = np.arange(values.shape[1]) % 3 == 2
-        solution = solve(self.group, values[:, ~held_out], margin)
-        test = values[:, held_out]
-        off = np.abs(test - np.einsum("nk,gik->gni", test[0], solution.matrices)).max(axis=1, initial=0.0)
-        solution.failed |= off > 3 * margin
-        hidden = torch.cat([samples.hidden[key] for key in keys]).numpy() > margin
-        solution.failed[1:] &= ~hidden
+    def _solve(self, keys: Keys, known: int) -> Solution:
+        """From the samples known, checked on the rest."""
+        values = torch.cat([self.samples.values[key] for key in keys], -1).numpy()
+        margin, rounding, size = (
+            np.concatenate([of(key) for key in keys]) for of in (self.margin, self.rounding, self.size)
+        )
+        solution = solve(self.group, values[:, :known], margin, rounding)
+        images = np.einsum("nk,gik->gni", values[0], solution.matrices)
+        off = np.abs(values - images).max(axis=1, initial=0.0)
+        solution.surprised = (off > 3 * margin) & ~solution.failed
+        solution.failed |= solution.surprised
+        solution.failed &= ~np.concatenate([self.hidden(key) for key in keys])
+        solution.off = np.where(solution.failed, 0.0, off / size).max(axis=0)
         return solution
 
-    def _unclear(self, solution: Solution) -> bool:
-        """Whether entries agree with others that hardly ever change."""
-        return any(solution.events[members].min() < _FEW for members in solution.twins)
-
-    def _label(self, samples: Samples) -> None:
-        for key, x in samples.values.items():
-            self.labels[key] = labels_of(samples.quantities, x[0].numpy(), self._margin(samples, key))
-
-    def _representations(
-        self, solutions: dict[Keys, Solution], samples: Samples
-    ) -> dict[NestedKey | Exchanged, Representation]:
+    def representations(self) -> dict[NestedKey | Exchanged, Representation]:
+        """Those found, by key, or by keys that change places."""
         found: dict[NestedKey | Exchanged, Representation] = {}
-        for keys, solution in solutions.items():
-            hidden = any((samples.hidden[key].numpy() > self._margin(samples, key)).any() for key in keys)
-            if not solution.complete or hidden:
+        for keys, solution in self.solutions.items():
+            if not solution.complete or any(self.hidden(key).any() for key in keys):
                 continue
-            representation = Representation(self.group, torch.as_tensor(solution.matrices))
-            shapes = [tuple(samples.shapes[key]) for key in keys]
+            shapes = [tuple(self.samples.shapes[key]) for key in keys]
+            representation = self._representation(solution)
             if len(keys) == 1:
                 found[keys[0]] = representation.unflatten(shapes[0])
-            elif len(shapes[0]) == 1:
+            elif all(len(shape) == 1 for shape in shapes):
                 found[Exchanged(*keys)] = representation
-            else:
+            elif len(set(shapes)) == 1:
                 found[Exchanged(*keys)] = representation.unflatten((len(keys), *shapes[0]))
+            else:
+                raise InferenceError(
+                    f"{keys} change places, but have the shapes {shapes}; flatten them with observe=..."
+                )
         return found
 
-    def _refuse(
-        self,
-        solutions: dict[Keys, Solution],
-        samples: Samples,
-        found: dict[NestedKey | Exchanged, Representation],
-    ) -> None:
-        partial = {key: r for key, r in found.items() if not isinstance(key, Exchanged)}
-        hidden = self._hidden(samples)
-        failed = [e for keys, s in solutions.items() for e in self._failures(keys, s, samples)]
-        if hidden:
-            raise InferenceError(
-                "one state is observed in two ways: the environment remembers something that MuJoCo's "
-                "state does not hold and an episode does not repeat (a command, a target, a phase), or draws "
-                "noise. Hand it over with infer(..., memory=...), switch the noise off, or drop the "
-                "entries with observe=...:",
-                [*hidden, *failed],
-                partial,
-            )
-        if failed:
-            raise InferenceError(
-                f"{len(failed)} images have not been found. Is the model symmetric (audit says), and all "
-                "that is observed? Drop the entries with observe=..., symmetrize the model, allow for "
-                "small asymmetries with tolerance=..., hand over commands and targets with memory=..., or "
-                "declare the key yourself:",
-                failed,
-                partial,
-            )
-        unclear = [
-            members for s in solutions.values() for members in s.twins if s.events[members].min() < _FEW
-        ]
-        if unclear:
-            names = [
-                f"{keys}[{m}]"
-                for keys, m in (
-                    (k, m) for k, s in solutions.items() for m in s.twins if s.events[m].min() < _FEW
-                )
-            ]
-            raise InferenceError(
-                f"too little happened to tell entries apart: {'; '.join(names[:6])} agree in all "
-                f"{samples.count} states, and differ from their usual value in fewer than {_FEW}; take "
-                "more samples=..., or starts in which they change"
-            )
-        still = [keys for keys, s in solutions.items() if (s.constant).any()]
-        if still and not samples.contacts and can_touch(self.sampler.subject.model):
-            raise InferenceError(
-                f"contact was never reached in {samples.count} states, and entries of {still} never "
-                "changed: contact forces or flags look like this. Take more samples=..., starts nearer to "
-                "the ground, or drop the entries with observe=..."
-            )
+    def _representation(self, solution: Solution) -> Representation:
+        matrices = torch.as_tensor(solution.matrices)
+        if matrices.shape[-1] == 0:
+            empty = torch.zeros(self.group.order, 0)
+            return Representation.from_blocks(self.group, [SignedPermutation(empty, empty)], check=False)
+        return Representation(self.group, matrices)
 
-    def _hidden(self, samples: Samples) -> list[Unexplained]:
-        out = []
-        for key, gap in samples.hidden.items():
-            size = samples.values[key].abs().amax(dim=(0, 1)).clamp(min=1e-12)
-            for i in np.flatnonzero(gap.numpy() > self._margin(samples, key)).tolist():
-                off = float(gap[i] / size[i])
-                reason = f"differs by {off:.2g} between two observations of one state"
-                out.append(Unexplained(key, i, self.labels[key][i], self.group.names[0], off, reason))
-        return out
 
-    def _failures(self, keys: Keys, solution: Solution, samples: Samples) -> list[Unexplained]:
-        data = torch.cat([samples.values[key] for key in keys], -1).numpy()
-        margin = np.concatenate([self._margin(samples, key) for key in keys])
-        labels = [label for key in keys for label in self.labels[key]]
-        places = [(key, i) for key in keys for i in range(samples.values[key].shape[-1])]
-        out = []
-        for i in np.flatnonzero(solution.failed.any(axis=0)).tolist():
-            g = int(np.flatnonzero(solution.failed[:, i])[0])
-            residual, reason = reason_of(data[0], data[g][:, i], i, float(margin[i]), labels)
-            reason = solution.reasons.get((g, i), reason)
-            out.append(Unexplained(*places[i], labels[i], self.group.names[g], residual, reason))
-        return out
+def unclear(solution: Solution) -> list[list[int]]:
+    """Entries that agree with others for want of events: they hardly ever change, or lie side by side.
 
-    def _note(self, solutions: dict[Keys, Solution], samples: Samples) -> None:
-        for keys, solution in solutions.items():
-            name = keys[0] if len(keys) == 1 else keys
-            still = np.flatnonzero(solution.constant).tolist()
-            if still:
-                self.notes.append(
-                    f"{name} {ranges(still)} never changed in {samples.count} states: stays as it is"
-                )
-            if solution.twins:
-                groups = "; ".join(", ".join(map(str, members)) for members in solution.twins[:8])
-                more = f" and {len(solution.twins) - 8} more" if len(solution.twins) > 8 else ""
-                self.notes.append(
-                    f"{name}: entries {groups}{more} always agree up to a sign, so that several "
-                    "permutations fit; of these each stays, or keeps its order among them"
-                )
+    Copies of an entry, in a goal or a history, are apart; a height scan over flat ground is not.
+    """
+    return [
+        members
+        for members in solution.twins
+        if solution.events[members].min() < _FEW
+        or any(c - a == 2 for a, c in zip(members, members[2:], strict=False))
+    ]
 
 
 def _exchanged(solution: Solution, sizes: Sequence[int], keys: Keys) -> list[Keys]:
@@ -226,9 +169,3 @@ def _exchanged(solution: Solution, sizes: Sequence[int], keys: Keys) -> list[Key
         a, b = label[owner[i]], label[owner[j]]
         label[label == max(a, b)] = min(a, b)
     return [tuple(keys[k] for k in np.flatnonzero(label == first)) for first in np.unique(label)]
-
-
-def ranges(numbers: Sequence[int]) -> str:
-    """``[0-3, 7]`` for 0, 1, 2, 3, 7."""
-    runs = np.split(np.array(numbers), np.flatnonzero(np.diff(numbers) > 1) + 1)
-    return "[" + ", ".join(f"{r[0]}-{r[-1]}" if len(r) > 1 else f"{r[0]}" for r in runs) + "]"

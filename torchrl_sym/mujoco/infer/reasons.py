@@ -6,6 +6,8 @@ import numpy as np
 
 from torchrl_sym.mujoco.model.types import Array
 
+_NEAR = 0.02  # relative distance at which an entry is nearly another
+
 
 def reason_of(data: Array, image: Array, index: int, margin: float, labels: list[str]) -> tuple[float, str]:
     """Relative distance from the nearest entry, and what the image looks like.
@@ -33,6 +35,11 @@ def reason_of(data: Array, image: Array, index: int, margin: float, labels: list
             sort = f"{'-' * (slope < 0)}{where} plus {offset:.4g}"
             return residual, f"its image is {sort}; observe it relative to a symmetric pose"
         return residual, f"its image is {slope:.4g} times {where}; scale both alike"
+    if residual < _NEAR:
+        return residual, (
+            f"its image is nearly {name}, off by {residual:.1g}: the model, its solver or its contacts are "
+            "not quite symmetric"
+        )
     same = np.abs(np.abs(image[:, None]) - np.abs(data)).max(axis=0)
     if same.min() <= margin:
         j = int(same.argmin())

@@ -17,13 +17,14 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_sym.mujoco.infer.errors import InferenceError
-from torchrl_sym.mujoco.infer.quantities import quantities_of
+from torchrl_sym.mujoco.infer.quantities import values_of
 from torchrl_sym.mujoco.verify.states import touches
 from torchrl_sym.mujoco.verify.subjects import Observation, Subject
 from torchrl_sym.representations import Representation
 
-SHORT, LONG, LAST = 4, 12, 8  # steps of most episodes, of every fourth; how many of a long one are kept
+SHORT, LONG, LAST = 4, 12, 8  # steps of most episodes, of every fourth; how many of a patient one are kept
 PATIENT = 100  # steps of an episode in search of entries that have not changed yet
+LOOKED_AT = 4  # rows of a batch in which contacts are counted
 
 
 @dataclass
@@ -35,21 +36,21 @@ class Samples:
         dtypes: its numbers.
         values: ``(N, n, d)`` float64 of every key: of state n and its image under g.
         hidden: largest difference between two observations of one state, ``(d,)`` of every key.
-        quantities: what MuJoCo computes, by name, ``(n,)``: to say what an entry seems to be.
-        contacts: number of states in contact.
+        quantities: what MuJoCo computes, ``(n, k)``: to say what an entry seems to be.
+        contacts: number of states in contact, of those that were looked at.
     """
 
     shapes: dict[NestedKey, torch.Size] = field(default_factory=dict)
     dtypes: dict[NestedKey, torch.dtype] = field(default_factory=dict)
     values: dict[NestedKey, Tensor] = field(default_factory=dict)
     hidden: dict[NestedKey, Tensor] = field(default_factory=dict)
-    quantities: dict[str, Tensor] = field(default_factory=dict)
+    quantities: Tensor | None = None
     contacts: int = 0
 
     @property
     def count(self) -> int:
         """Number of states."""
-        return next((x.shape[1] for x in self.values.values()), 0)
+        return 0 if self.quantities is None else len(self.quantities)
 
 
 @dataclass
@@ -93,31 +94,26 @@ class Sampler:
         return self.samples
 
     def _add(self, steps: int, skip: int) -> None:
-        order = self.action.group.order
         try:
             episode = self._original(steps)
-            plays = [self._play(episode, g, skip) for g in (*range(order), 0)]
+            plays = [self._play(episode, g, skip) for g in (*range(self.action.group.order), 0)]
         except RuntimeError:  # dm_control's physics diverged: far too deep in a contact
-            self.episodes += 1
             return
-        self.episodes += 1
-        observed, quantities, touching = plays[0]
-        keys = list(observed)
-        whole = {key: torch.stack([play[0][key] for play in plays]) for key in keys}  # (N + 1, n, d)
+        finally:
+            self.episodes += 1
+        whole = {key: torch.stack([play[key] for play in plays]) for key in plays[0]}  # (N + 1, n, d)
+        quantities = whole.pop("")[0]
         finite = torch.stack([x.isfinite().all(-1).all(0) for x in whole.values()]).all(0)
-        self.samples.contacts += int(touching[finite].sum())
         for key, x in whole.items():
-            x = x[:, finite]
-            gap = (x[0] - x[-1]).abs().amax(0) if x.shape[1] else torch.zeros(x.shape[-1])
-            self._append(self.samples.values, key, x[:-1], 1)
-            known = self.samples.hidden.get(key, gap)
-            self.samples.hidden[key] = torch.maximum(known, gap)
-        for name, x in quantities.items():
-            self._append(self.samples.quantities, name, x[finite], 0)
-
-    @staticmethod
-    def _append(store: dict[Any, Tensor], key: Any, x: Tensor, dim: int) -> None:
-        store[key] = torch.cat([store[key], x], dim) if key in store else x
+            values, gap = x[:-1, finite], (x[0] - x[-1])[finite].abs()
+            if key in self.samples.values:
+                values = torch.cat([self.samples.values[key], values], 1)
+                gap = torch.cat([self.samples.hidden[key][None], gap])
+            self.samples.values[key] = values
+            self.samples.hidden[key] = gap.amax(0) if len(gap) else values.new_zeros(values.shape[-1])
+        known = self.samples.quantities
+        more = quantities[finite]
+        self.samples.quantities = more if known is None else torch.cat([known, more])
 
     def _original(self, steps: int) -> _Episode:
         subject = self.subject
@@ -125,39 +121,30 @@ class Sampler:
         start = subject.vary(subject.state(), self.generator, self.episodes)
         subject.begin(start)
         episode = _Episode([], [subject.state()])
-        for _ in range(steps):
+        for step in range(steps):
             episode.actions.append(random_action(subject, self.generator))
             subject.step(episode.actions[-1])
             state = subject.state()
-            disturbed = len(episode.states) % 2 == 1
-            episode.states.append(subject.disturb(state, self.generator) if disturbed else state)
+            rows = range(min(LOOKED_AT, subject.rows))
+            self.samples.contacts += sum(touches(subject.model, state, row) for row in rows)
+            episode.states.append(subject.disturb(state, self.generator) if step % 2 == 0 else state)
         return episode
 
-    def _play(
-        self, episode: _Episode, g: int, skip: int
-    ) -> tuple[dict[NestedKey, Tensor], dict[str, Tensor], Tensor]:
-        """Everything observed along the image of an episode, with quantities and whether it touched."""
+    def _play(self, episode: _Episode, g: int, skip: int) -> dict[NestedKey, Tensor]:
+        """Everything observed along the image of an episode, and under ``""`` what has a name."""
         subject = self.subject
-        seen: list[Observation] = []
-        quantities: list[dict[str, Tensor]] = []
-        touching: list[Tensor] = []
+        seen: list[dict[NestedKey, Tensor]] = []
         for step, state in enumerate(episode.states):
             image = subject.transform(state, g)
             if step == 0:
                 observation = subject.begin(image)
             else:
                 observation = subject.advance(self.action(episode.actions[step - 1], g), image)
-            if step < skip:
-                continue
             self._note_shapes(observation)
-            seen.append({key: x.flatten(1).double() for key, x in observation.items()})
-            if g == 0:
-                quantities.append(quantities_of(subject, state))
-                touched = [touches(subject.model, state, row) for row in range(subject.rows)]
-                touching.append(torch.tensor(touched))
-        merged = {key: torch.cat([each[key] for each in seen]) for key in seen[0]}
-        named = {name: torch.cat([q[name] for q in quantities]) for name in (quantities or [{}])[0]}
-        return merged, named, torch.cat(touching) if touching else torch.zeros(0)
+            if step >= skip:
+                seen.append({key: x.flatten(1).double() for key, x in observation.items()})
+                seen[-1][""] = values_of(subject, image)
+        return {key: torch.cat([each[key] for each in seen]) for key in seen[0]}
 
     def _note_shapes(self, observation: Observation) -> None:
         for key, x in observation.items():

@@ -30,6 +30,8 @@ class Solution:
         constant: entries that never change, ``(d,)`` bool.
         twins: entries that always agree up to a sign, two or more.
         events: how many samples differ from the most common value, ``(d,)``.
+        off: largest distance of each entry from its image, relative to the entry, ``(d,)``.
+        surprised: entries whose image fits all samples but the ones held out, ``(N, d)`` bool.
     """
 
     matrices: Array
@@ -38,6 +40,8 @@ class Solution:
     constant: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
     twins: list[list[int]] = field(default_factory=list)
     events: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
+    off: Array = field(default_factory=lambda: np.zeros(0))
+    surprised: Array = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     @property
     def complete(self) -> bool:
@@ -45,42 +49,49 @@ class Solution:
         return not self.failed.any()
 
 
-def solve(group: PointGroup, samples: Array, margin: Array) -> Solution:
+def solve(group: PointGroup, samples: Array, margin: Array, rounding: Array) -> Solution:
     """Find how entries transform.
 
     Args:
         group: the group.
         samples: what is observed in states and their images, ``(N, n, d)``.
-        margin: largest difference of each entry, ``(d,)``.
+        margin: largest difference of each entry from its image, ``(d,)``.
+        rounding: largest difference between entries of one state that counts as none, ``(d,)``.
     """
-    order, _, size = samples.shape
-    data = samples.reshape(-1, size)  # states h s
-    images = np.stack([samples[group.table[g].numpy()].reshape(-1, size) for g in range(order)])  # g h s
+    order, count, size = samples.shape
+    data = samples.reshape(order * count, size)  # states h s
+    images = np.stack(
+        [samples[group.table[g].numpy()].reshape(order * count, size) for g in range(order)]
+    )  # g h s
 
-    classes = classes_of(data, margin)
+    classes = classes_of(data, rounding)
     found = Solution(np.zeros((order, size, size)), np.zeros((order, size), dtype=bool))
     found.constant, found.twins = classes.constant, [m for m in classes.members if len(m) > 1]
-    found.events = _events(samples[0], margin)
+    found.events = _events(samples[0], rounding)
     stay = np.flatnonzero(classes.constant)
     found.matrices[:, stay, stay] = 1.0
 
     firsts = [members[0] for members in classes.members]
-    reduced, failed = _reduced(group, data[:, firsts], images[:, :, firsts], margin[firsts])
+    reduced, failed = _reduced(
+        group, data[:, firsts], images[:, :, firsts], margin[firsts], rounding[firsts]
+    )
     _expand(classes, reduced, failed, found)
     return found
 
 
-def _events(samples: Array, margin: Array) -> Array:
+def _events(samples: Array, rounding: Array) -> Array:
     """How many samples differ from the entry's most common value."""
     ordered = np.sort(samples, axis=0)
     out = np.zeros(samples.shape[1], dtype=int)
     for i, column in enumerate(ordered.T):
-        ends = np.searchsorted(column, column + margin[i], side="right")
+        ends = np.searchsorted(column, column + rounding[i], side="right")
         out[i] = len(column) - int((ends - np.arange(len(column))).max(initial=0))
     return out
 
 
-def _reduced(group: PointGroup, data: Array, images: Array, margin: Array) -> tuple[Array, Array]:
+def _reduced(
+    group: PointGroup, data: Array, images: Array, margin: Array, rounding: Array
+) -> tuple[Array, Array]:
     """Matrices on one entry of each class, and which rows have none."""
     order, size = len(images), data.shape[1]
     matrices, failed = np.zeros((order, size, size)), np.zeros((order, size), dtype=bool)
@@ -88,8 +99,10 @@ def _reduced(group: PointGroup, data: Array, images: Array, margin: Array) -> tu
     for g in range(order):
         for i, candidates in enumerate(matches(data, images[g], margin)):
             if candidates:
-                j, sign = min(candidates, key=lambda c: (c[0] != i, c[0]))
-                matrices[g, i, j] = sign
+                equal = max(10 * candidates[0].off, rounding[i])  # as good as the best
+                best = [match for match in candidates if match.off <= equal]
+                match = min(best, key=lambda match: (match.index != i, match.off))
+                matrices[g, i, match.index] = match.sign
             else:
                 mixed.add(i)
     while True:  # entries that are exchanged with mixed ones are mixed by other elements

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
+import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from torchrl_sym.mujoco.verify.poses import random_pose
+from torchrl_sym.mujoco.verify.states import physics_states
 from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Subject
 
 
@@ -44,6 +48,13 @@ class BatchedSubject(Subject):
 
     def transform(self, state: Any, g: int) -> Any:
         return self.env.task.transform_state(state, g)
+
+    def vary(self, state: Any, generator: torch.Generator, number: int) -> Any:
+        poses = [
+            random_pose(self.model, row, generator, number) for row in physics_states(self.model, state)
+        ]
+        qpos, qvel = (torch.cat([getattr(pose, x) for pose in poses]) for x in ("qpos", "qvel"))
+        return dataclasses.replace(state, qpos=qpos, qvel=qvel)
 
     def map_ctrl(self, ctrl: Tensor, g: int) -> Tensor | None:
         robot = getattr(self.env.task, "robot", None)

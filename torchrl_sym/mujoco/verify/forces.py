@@ -21,6 +21,7 @@ from torchrl_sym.mujoco.model.types import Array, MjModel, mj
 from torchrl_sym.representations import Representation
 
 _CLOSE = 1e-2  # of the model's extent: how far a body's image may be from where its place goes
+_SAME = 1e-5  # m: bodies no farther apart are at one place
 _SIZE = 0.5  # largest number that is added: environments clip forces at 1
 
 
@@ -50,6 +51,13 @@ class Disturbances:
             size = (1, model.nsensordata)
             out["sensordata"] = _SIZE * torch.rand(size, generator=generator, dtype=torch.float64)
         return out
+
+    @staticmethod
+    def anything(model: MjModel, generator: torch.Generator) -> dict[str, Tensor]:
+        """Additions to everything, whether or not their images are known."""
+        sizes = {"cfrc_ext": (1, model.nbody, 6), "sensordata": (1, model.nsensordata)}
+        draws = {k: torch.rand(x, generator=generator, dtype=torch.float64) for k, x in sizes.items()}
+        return {name: _SIZE * (0.5 + draw) for name, draw in draws.items()}
 
     def image(self, added: dict[str, Tensor], g: int) -> dict[str, Tensor]:
         """Images of what was drawn."""
@@ -93,7 +101,8 @@ def _body_images(robot: ModelSymmetry, pose: Any, transform: Callable[[Any, int]
         there = _places(model, transform(pose, g))
         moved = np.concatenate([(x - axis) @ turn.T + axis for x in (here[:, :3], here[:, 3:])], axis=1)
         off = np.linalg.norm(moved[:, None] - there, axis=2)
-        near = off < _CLOSE * float(model.stat.extent)
+        nearest = off.min(axis=1, keepdims=True)
+        near = (off <= nearest + _SAME) & (nearest < _CLOSE * float(model.stat.extent))
         near &= np.abs(model.body_mass[:, None] - model.body_mass) <= 0.1 * model.body_mass.max() + 1e-9
         # several bodies at one place: the k-th of them goes to the k-th
         for places, bodies in itertools.groupby(range(model.nbody), key=lambda b: near[b].tobytes()):
@@ -101,5 +110,10 @@ def _body_images(robot: ModelSymmetry, pose: Any, transform: Callable[[Any, int]
             if len(mine) == len(theirs):
                 out[g, mine] = theirs
     out[0] = np.arange(model.nbody)
-    clear = np.array([len(set(row[row >= 0])) == (row >= 0).sum() for row in out]).all()
-    return out if clear else np.where(np.arange(group.order)[:, None] == 0, out, -1)
+    while True:  # bodies are known if all that they are exchanged with are
+        known = (out >= 0).all(axis=0)
+        for row in out:
+            known &= known[row] & (np.bincount(row[row >= 0], minlength=model.nbody)[row] == 1)
+        if known[(out >= 0).all(axis=0)].all():
+            return out
+        out[:, ~known] = -1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,14 @@ from torchrl_sym.mujoco.verify.physics import PhysicsSubject
 from torchrl_sym.mujoco.verify.remembered import Remembered
 from torchrl_sym.mujoco.verify.states import PhysicsState
 from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Pose
+
+# gymnasium's wrappers that make an observation of more than one.
+_REMEMBERING = (
+    "FrameStackObservation",
+    "DelayObservation",
+    "TimeAwareObservation",
+    "MaxAndSkipObservation",
+)
 
 
 class GymnasiumSubject(PhysicsSubject):
@@ -39,6 +48,9 @@ class GymnasiumSubject(PhysicsSubject):
         while env is not self.base:
             self.wrappers.append(env)
             env = env.env
+        kept = [type(w).__name__ for w in self.wrappers if type(w).__name__ in _REMEMBERING]
+        if kept:
+            self.hint = f"; single states do not go through {kept[0]}, which remembers: take what is inside"
         self.base.reset(seed=seed)
 
     @property
@@ -51,7 +63,7 @@ class GymnasiumSubject(PhysicsSubject):
         return value
 
     def observe(self) -> Observation:
-        return self.entries(self._apply("observation", self.base._get_obs()))
+        return self.entries(self._apply("observation", observed(self.base)))
 
     def reset(self) -> Observation:
         self.base.reset()
@@ -68,7 +80,7 @@ class GymnasiumSubject(PhysicsSubject):
         def reset(**kwargs: Any) -> tuple[Any, dict[str, Any]]:
             _, info = inner(**kwargs)
             self.put(state)
-            return self.base._get_obs(), info
+            return observed(self.base), info
 
         return self.entries(self._through("reset", reset, self.env.reset)[0])
 
@@ -78,7 +90,7 @@ class GymnasiumSubject(PhysicsSubject):
         def step(values: Any) -> tuple[Any, ...]:
             _, *rest = inner(values)
             self.put(state)
-            return self.base._get_obs(), *rest
+            return observed(self.base), *rest
 
         return self.entries(self._through("step", step, lambda: self.env.step(self._shaped(action)))[0])
 
@@ -92,3 +104,23 @@ class GymnasiumSubject(PhysicsSubject):
 
     def _shaped(self, action: Tensor) -> Any:
         return action[0].numpy().reshape(self.env.action_space.shape)
+
+
+def observed(env: Any) -> Any:
+    """What an environment observes now; some (mazes) make it of what the robot inside them observes."""
+    needed = [
+        p
+        for p in inspect.signature(env._get_obs).parameters.values()
+        if p.default is p.empty and p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)
+    ]
+    if not needed:
+        observation = env._get_obs()
+    else:
+        inside = [x for x in vars(env).values() if hasattr(x, "_get_obs") and hasattr(x, "data")]
+        if len(needed) > 1 or len(inside) != 1:
+            raise TypeError(
+                f"expected _get_obs() without arguments, got {[p.name for p in needed]} in "
+                f"{type(env).__name__}; give the environment a _get_obs() that needs none"
+            )
+        observation = env._get_obs(observed(inside[0]))
+    return observation[0] if isinstance(observation, tuple) else observation

@@ -131,7 +131,7 @@ class Measurement:
             if size != representation.dim:
                 raise ValueError(
                     f"{key!r}: the environment observes {size} entries, its representation has "
-                    f"{representation.dim}; list every entry in order"
+                    f"{representation.dim}; list every entry in order{self.subject.hint}"
                 )
             found[key] = x.reshape(len(x), *representation.event_shape)
         return found

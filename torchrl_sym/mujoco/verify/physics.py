@@ -83,6 +83,14 @@ class PhysicsSubject(Subject):
     def disturb(self, state: PhysicsState, generator: torch.Generator) -> PhysicsState:
         return dataclasses.replace(state, added=self.disturbances.draw(generator))
 
+    def probe(self, generator: torch.Generator) -> tuple[Observation, Observation]:
+        self.reset()
+        state = self.state()
+        plain = self.begin(state)
+        return plain, self.begin(
+            dataclasses.replace(state, added=Disturbances.anything(self.model, generator))
+        )
+
     def map_ctrl(self, ctrl: Tensor, g: int) -> Tensor | None:
         return self.robot.map_ctrl(ctrl, g) if self.model.nu else None
 

@@ -55,7 +55,7 @@ def _turn_joints(model: MjModel, qpos: Array, random: np.random.Generator) -> No
             q = random.standard_normal(4)
             qpos[i : i + 4] = q / np.linalg.norm(q)
             if kind == FREE:
-                qpos[i - 3 : i - 1] += 0.1 * float(model.stat.extent) * random.standard_normal(2)
+                qpos[i - 3 : i - 1] += 0.3 * float(model.stat.extent) * random.standard_normal(2)
         elif model.jnt_limited[j]:
             qpos[i] = random.uniform(*model.jnt_range[j])
         else:

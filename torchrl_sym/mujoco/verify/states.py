@@ -45,6 +45,16 @@ def read_state(data: MjData, memory: dict[str, Any]) -> PhysicsState:
     return PhysicsState(**rows, time=float(data.time), memory=memory)
 
 
+def physics_states(model: MjModel, state: Any) -> list[PhysicsState]:
+    """Each row of another kind of state; what it lacks is as the model has it."""
+    rows = []
+    for row in range(len(state.qpos)):
+        data = mj.MjData(model)
+        write_state(data, state, row)
+        rows.append(read_state(data, {}))
+    return rows
+
+
 def write_state(data: MjData, state: Any, row: int = 0) -> None:
     """Write one row of a state into an ``MjData``; what the state lacks keeps its value."""
     for name in _FIELDS:

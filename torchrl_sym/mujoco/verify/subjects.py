@@ -50,6 +50,7 @@ class Subject(abc.ABC):
         model: the MuJoCo model.
         rows: number of simulations that step together.
         low: smallest action, ``(actions,)``; ``high`` likewise.
+        hint: what else may be wrong if sizes do not fit.
         searches: how many poses :meth:`touching` tries.
     """
 
@@ -57,6 +58,7 @@ class Subject(abc.ABC):
     rows: int
     low: Tensor
     high: Tensor
+    hint = ""
     searches = 0
 
     def __init__(self, observe: Callable[[Any], Any] | None) -> None:
@@ -103,6 +105,10 @@ class Subject(abc.ABC):
     def disturb(self, state: Any, generator: torch.Generator) -> Any:
         """The same state, observed as if there were other contact forces, if they can be had."""
         return state
+
+    def probe(self, generator: torch.Generator) -> tuple[Observation, Observation] | None:
+        """What is observed in a state, and there with other contact forces and sensor readings."""
+        return None
 
     def touching(self, generator: torch.Generator) -> Any | None:
         """A state in which something touches, if one is easily found."""
