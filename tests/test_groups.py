@@ -289,7 +289,9 @@ def test_turned_groups_are_conjugate(group):
 
 @pytest.mark.parametrize("axis", ["z", "X", None])
 def test_reflection_takes_a_horizontal_axis(axis):
-    with pytest.raises(ValueError, match=r"expected axis 'x' or 'y', or its angle.*got.*PointGroup.generate"):
+    with pytest.raises(
+        ValueError, match=r"expected axis 'x' or 'y', or its angle.*got.*PointGroup.generate"
+    ):
         PointGroup.reflection(axis)
 
 
