@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sym.mujoco.audit.report import Kind, Residual
 from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
 from torchrl_sym.mujoco.model.links import links_of
 from torchrl_sym.mujoco.model.types import Array, name_of
@@ -20,13 +21,14 @@ class Comparison:
         self.links = self.matcher.links
         self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
-        self.worst: dict[str, tuple[float, str]] = {}
+        self.element = symmetry.group.names[g]
+        self.worst: dict[str, Residual] = {}
         self.unchecked: list[str] = []
 
-    def add(self, term: str, residual: float, name: str) -> None:
+    def add(self, term: str, residual: float, name: str, kind: Kind = "dynamics", amount: str = "") -> None:
         """Keep the worst part of each term."""
-        if term not in self.worst or residual > self.worst[term][0]:
-            self.worst[term] = (residual, name)
+        if term not in self.worst or residual > self.worst[term].residual:
+            self.worst[term] = Residual(self.element, term, residual, name, kind, amount)
 
     def name(self, kind: str, a: int, b: int) -> str:
         name = name_of(self.model, kind, a)
