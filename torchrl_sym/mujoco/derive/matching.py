@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from torchrl_sym.mujoco.model.links import Link
+from torchrl_sym.mujoco.model.links import Link, sizes_of
 from torchrl_sym.mujoco.model.types import BALL, FREE, SLIDE, Array, MjData, MjModel, mj
 
 _MISFIT = 1e3  # cost of a pair that cannot be the image of each other; far above any distance
@@ -28,6 +28,7 @@ class Matcher:
         carried: bodies that are only carried along, so that their frames turn with the world.
 
     Attributes:
+        extent: size of the largest tree of moving links, which lengths are made relative to.
         image: kinematics where images are looked for: the reference pose, carried bodies turned by R.
     """
 
@@ -44,7 +45,8 @@ class Matcher:
         self.matrix, self.lift, self.carried = matrix, lift, carried
         self.image = self._carry() if carried else data
         self.det = round(float(np.linalg.det(matrix)))
-        self.extent = max(float(model.stat.extent), 1e-6)
+        sizes = sizes_of(model, data, links).values()
+        self.extent = max(sizes, default=max(float(model.stat.extent), 1e-6))
         self.total_mass = max(sum(link.mass for link in links.values()), 1e-12)
         self.total_inertia = max(max(np.trace(link.inertia) for link in links.values()), 1e-12)
         self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}

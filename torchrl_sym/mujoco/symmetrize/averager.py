@@ -52,7 +52,7 @@ class Averager:
             for action in self.actions
         ]
         self.rotation = self.data.xmat.reshape(-1, 3, 3)
-        self.extent = max(float(self.model.stat.extent), 1e-6)
+        self.extent = self.actions[0].matcher.extent
         names = sorted(name_of(self.model, "body", b) for b in self.carried)
         # of every link: the point that its tree is averaged about, how far the tree is moved, and the link
         self.origin = {b: np.zeros(3) for b in self.links}
