@@ -80,7 +80,7 @@ def worst_step(compiled, group, seeds=range(6)) -> float:
 def test_perturbed_robot_becomes_exact(name, frames, seed):
     spec = perturb(specification(name, frames), seed)
     assert worst_step(spec.compile(), GROUPS[name]) > 1e-3
-    compiled = symmetrize(spec, GROUPS[name]).compile()
+    compiled = symmetrize(spec, GROUPS[name], tolerance=3e-2).compile()
     assert audit(compiled, GROUPS[name]).exact, str(audit(compiled, GROUPS[name]))
     assert worst_step(compiled, GROUPS[name]) <= 1e-9
 
@@ -185,7 +185,7 @@ def test_free_body_away_from_the_centre_stays_there():
     spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
       <body name="cube" pos="1 2 .1"><freejoint/><geom type="box" size=".1 .1 .1" pos="0 .002 0"/></body>
       </worldbody></mujoco>""")
-    after, report = symmetrize_with_report(spec, K4)
+    after, report = symmetrize_with_report(spec, K4, tolerance=3e-2)
     compiled = after.compile()
     assert compiled.qpos0[:3] == pytest.approx([1, 2, 0.1])
     assert {change.term for change in report.changes} == {"centre of mass", "geom position"}

@@ -4,8 +4,10 @@ With R the isometry, d its determinant, X_b the world rotation of body b at the 
 the image of link b, the part of the isometry that acts within the body frame is V_b = X_s(b)^T R X_b. Then
 
 - a hinge or slide coordinate becomes q'_s(j) = sign_j q_j + offset_j, with the sign from its axis;
-- a free joint's position becomes R p, its rotation R X V_b^-1, its velocities R v (world) and d V_b w
-  (body frame);
+- a free joint's position becomes R p + t, its rotation R X V_b^-1, its velocities R v (world) and d V_b w
+  (body frame), where x -> R x + t is the isometry, t = (I - R) o for an axis through o. That is so if the
+  image of the frame's origin is the origin of the image's frame; bodies for which it is not are astray: how
+  their position moves would depend on their rotation;
 - a body that is only carried along by a turn of the world keeps its own frame, V_b = I: its image is looked
   for at R X_b, and its rotation becomes R X, its angular velocity stays;
 - a ball joint's rotation, relative to its parent p, becomes B_s(b)^T V_p B_b X V_b^-1 with B_b the fixed
@@ -23,14 +25,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchrl_sym.mujoco.derive.matching import Matcher
-from torchrl_sym.mujoco.model.links import Link
+from torchrl_sym.mujoco.model.links import Link, is_loose
 from torchrl_sym.mujoco.model.rotations import conjugate, product, sandwich
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, MjData, MjModel
+
+_ROUNDING = 1e-12  # offsets below it are none
 
 
 @dataclass
 class CoordinateMap:
-    """One element's action, as matrices on the full vectors plus constants."""
+    """One element's action, as matrices on the full vectors plus constants.
+
+    ``astray`` says of free and mocap bodies how far the image of their frame's origin is from that of their
+    image, if it is not there.
+    """
 
     joints: dict[int, int]
     signs: dict[int, float]
@@ -41,7 +49,9 @@ class CoordinateMap:
     qpos_offset: Array
     qvel: Array
     mocap_position: Array
+    mocap_offset: Array
     mocap_rotation: Array
+    astray: dict[int, float]
 
 
 def map_coordinates(
@@ -69,8 +79,14 @@ def map_coordinates(
         np.zeros(model.nq),
         np.zeros((model.nv, model.nv)),
         np.zeros((3 * model.nmocap, 3 * model.nmocap)),
+        np.zeros(3 * model.nmocap),
         np.zeros((4 * model.nmocap, 4 * model.nmocap)),
+        {},
     )
+    for a, b in images.items():
+        gap = float(np.linalg.norm(turn @ data.xpos[a] - image.xpos[b]))
+        if is_loose(model, a) and gap > 1e-9 * matcher.extent:
+            out.astray[a] = gap
 
     def q_frame(a: int) -> Array:  # x_s(b)^-1 q_R x_b, a lift of d V_b
         if a in matcher.carried:
@@ -85,11 +101,13 @@ def map_coordinates(
             handed = det if kind == HINGE else 1
             sign = 1.0 if handed * float(turn @ data.xaxis[i] @ data.xaxis[j]) > 0 else -1.0
             offset = float(data.qpos[qj] - sign * data.qpos[qi])
+            offset *= abs(offset) > _ROUNDING
             out.signs[i], out.offsets[i] = sign, offset
             out.qpos[qj, qi] = out.qvel[vj, vi] = sign
             out.qpos_offset[qj] = offset
         elif kind == FREE:
             out.qpos[qj : qj + 3, qi : qi + 3] = turn
+            out.qpos_offset[qj : qj + 3] = matcher.shift
             out.qpos[qj + 3 : qj + 7, qi + 3 : qi + 7] = sandwich(q_turn, conjugate(q_frame(body)))
             out.qvel[vj : vj + 3, vi : vi + 3] = turn
             out.qvel[vj + 3 : vj + 6, vi + 3 : vi + 6] = det * frames[body]
@@ -107,6 +125,7 @@ def map_coordinates(
         if model.body_mocapid[a] >= 0:
             i, j = 3 * int(model.body_mocapid[a]), 3 * int(model.body_mocapid[b])
             out.mocap_position[j : j + 3, i : i + 3] = turn
+            out.mocap_offset[j : j + 3] = matcher.shift
             i, j = 4 * i // 3, 4 * j // 3
             out.mocap_rotation[j : j + 4, i : i + 4] = sandwich(q_turn, conjugate(q_frame(a)))
     return out

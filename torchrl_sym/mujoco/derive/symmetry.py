@@ -13,9 +13,10 @@ from torch import Tensor
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.action import Action
+from torchrl_sym.mujoco.derive.bodies import map_bodies
 from torchrl_sym.mujoco.derive.images import Image
 from torchrl_sym.mujoco.derive.sensors import SensorMap, SensorMapper, sensor_matrices
-from torchrl_sym.mujoco.model.types import Array, MjModel, check_mocap, name_of
+from torchrl_sym.mujoco.model.types import FREE, Array, MjModel, check_mocap, label_of, name_of
 from torchrl_sym.representations import Representation
 from torchrl_sym.representations.blocks import SignedPermutation, block_from_matrices
 
@@ -55,23 +56,36 @@ class ModelSymmetry:
             relative to a pose that the group keeps.
         joint_velocities: the same for their velocities.
         actuators: representation of the controls, relative to such a pose.
-        qvel: representation of the full velocity; also of ``qacc_warmstart``.
+        axis: a point (x, y) of the vertical axis that the group acts about, in the world.
+        pose: in words, the pose that the group keeps.
+        ambiguous: sentences on parts that nothing tells apart, so that their images were chosen freely.
     """
 
-    def __init__(self, model: MjModel, group: PointGroup, actions: Sequence[Action]) -> None:
+    def __init__(
+        self,
+        model: MjModel,
+        group: PointGroup,
+        actions: Sequence[Action],
+        pose: str = "qpos0",
+        ambiguous: Sequence[str] = (),
+    ) -> None:
         self.model = model
         self.group = group
+        self.pose, self.ambiguous = pose, tuple(ambiguous)
+        x, y, _ = actions[0].matcher.axis.tolist()
+        self.axis: tuple[float, float] = (x, y)
         self.actions = list(actions)
         self._scalar = [j for j in range(model.njnt) if j in actions[0].coordinates.signs]
         self.joint_positions = self._joint_representation(self._scalar)
         self.joint_velocities = self.joint_positions
         self.actuators = self._represent([action.ctrl for action in actions])
-        self.qvel = self._represent([action.coordinates.qvel for action in actions])
+        self._map_qvel = self._represent([action.coordinates.qvel for action in actions])
         positions = self._represent([action.coordinates.qpos for action in actions])
         self._map_qpos = _Affine(positions, [action.coordinates.qpos_offset for action in actions])
         self._map_ctrl = _Affine(self.actuators, [action.ctrl_offset for action in actions])
         self._act = self._represent([action.act for action in actions])
-        self._mocap_position = self._represent([a.coordinates.mocap_position for a in actions])
+        places = self._represent([a.coordinates.mocap_position for a in actions])
+        self._mocap_position = _Affine(places, [a.coordinates.mocap_offset for a in actions])
         self._mocap_rotation = self._represent([a.coordinates.mocap_rotation for a in actions])
 
     def _represent(self, matrices: list[Array]) -> Representation:
@@ -87,6 +101,32 @@ class ModelSymmetry:
         parts = [slice(a, b) for a, b in zip([0, *ends[:-1]], ends, strict=True)]
         blocks = [block_from_matrices(torch.as_tensor(whole[:, part, part])) for part in parts]
         return Representation.from_blocks(self.group, blocks)
+
+    @property
+    def qvel(self) -> Representation:
+        """Representation of the full velocity; also of ``qacc_warmstart``.
+
+        Raises:
+            ValueError: a free body's frame is beside its plane of symmetry.
+        """
+        self._check_frames(FREE)
+        return self._map_qvel
+
+    def _check_frames(self, kind: int) -> None:
+        """ValueError if a free (or mocap) body's position has no affine image, as its frame is astray."""
+        gaps = [
+            (gap, body)
+            for action in self.actions
+            for body, gap in action.coordinates.astray.items()
+            if (self.model.body_mocapid[body] < 0) == (kind == FREE)
+        ]
+        if gaps:
+            gap, body = max(gaps)
+            raise ValueError(
+                f"the frame of {label_of(self.model, 'body', body)} is {500 * gap:.3g} mm beside where the "
+                "body is symmetric: the image of its position depends on its rotation, and no matrix maps "
+                "it; move the frame's origin (the body's pos) onto the plane or axis of symmetry"
+            )
 
     def _joint_representation(self, joints: list[int]) -> Representation:
         place = {j: i for i, j in enumerate(joints)}
@@ -105,17 +145,31 @@ class ModelSymmetry:
             matrices.append(matrix)
         return self._represent(matrices)
 
-    def joints(self, names: Sequence[str]) -> Representation:
+    def joints(self, names: Sequence[str], *, relative: bool = False) -> Representation:
         """Representation of some hinge and slide joints, in the order of their names.
+
+        Args:
+            names: of the joints.
+            relative: whether it is for velocities or torques, or for positions relative to a pose that the
+                group keeps. Positions as such may need an offset, which no representation has.
 
         Raises:
             KeyError: no such joint.
-            ValueError: an element sends one of them to a joint that is not among them.
+            ValueError: an element sends one of them to a joint that is not among them, or positions of one
+                need an offset and are not relative.
         """
         known = {name_of(self.model, "joint", j): j for j in self._scalar}
         missing = [name for name in checks.names("joints", names, least=0) if name not in known]
         if missing:
             raise KeyError(f"no hinge or slide joints {missing}; the model has {list(known)}")
+        shifted = {n: o for g in self.group.names for n, o in self.offsets(g).items() if n in names}
+        if shifted and not relative:
+            name, offset = max(shifted.items(), key=lambda item: abs(item[1]))
+            raise ValueError(
+                f"positions of {list(shifted)} have an offset ({name!r}: {offset:.4g}), as the model's "
+                "zero is not symmetric; use map_qpos, or relative=True for positions relative to a "
+                "symmetric pose"
+            )
         return self._joint_representation([known[name] for name in names])
 
     @functools.cached_property
@@ -162,7 +216,11 @@ class ModelSymmetry:
         images = {
             "joint": {a: Image(b, signs.get(a, 1.0)) for a, b in action.coordinates.joints.items()},
             "actuator": action.actuators,
-            "body": {a: Image(b) for a, b in action.coordinates.bodies.items()},
+            "body": {
+                a: Image(b)
+                for a, b in map_bodies(action.matcher, action.tolerance).items()
+                if kind == "body"
+            },
             "site": {a: Image(b) for a, b in action.sites.items()},
             "tendon": action.tendons,
             "sensor": self._sensors[self.group.index(g)].images if kind == "sensor" else {},
@@ -191,7 +249,8 @@ class ModelSymmetry:
 
         Raises:
             KeyError: no such element.
-            ValueError: a last dimension other than nq, or indices of another shape.
+            ValueError: a last dimension other than nq, indices of another shape, or a free body whose frame
+                is beside its plane of symmetry.
 
         Example:
             >>> import mujoco
@@ -203,6 +262,7 @@ class ModelSymmetry:
             >>> robot.map_qpos(torch.tensor([[1.0], [2.0]]), torch.tensor([0, 1])).tolist()
             [[1.0], [-2.0]]
         """
+        self._check_frames(FREE)
         return self._map_qpos(qpos, g)
 
     def map_qvel(self, qvel: Tensor, g: int | str | Tensor) -> Tensor:
@@ -220,14 +280,17 @@ class ModelSymmetry:
     def map_mocap(self, position: Tensor, rotation: Tensor, g: int | str | Tensor) -> tuple[Tensor, Tensor]:
         """Image of mocap poses ``(..., nmocap, 3)`` and ``(..., nmocap, 4)``."""
         check_mocap(self.model, position, rotation)
+        self._check_frames(-1)
         images = (
-            representation(x.flatten(-2), g).unflatten(-1, x.shape[-2:])
-            for representation, x in ((self._mocap_position, position), (self._mocap_rotation, rotation))
+            image(x.flatten(-2), g).unflatten(-1, x.shape[-2:])
+            for image, x in ((self._mocap_position, position), (self._mocap_rotation, rotation))
         )
         return next(images), next(images)
 
     def __str__(self) -> str:
-        lines = [f"symmetry of {self.model.nbody - 1} bodies under {self.group!r}"]
+        x, y = self.axis
+        at = f" about ({x:.4g}, {y:.4g})" if x or y else ""
+        lines = [f"symmetry of {self.model.nbody - 1} bodies under {self.group!r}{at}, at {self.pose}"]
         for kind in ("joint", "actuator"):
             tables = [self.table(kind, g) for g in range(self.group.order)]
             if not tables[0]:
@@ -238,4 +301,8 @@ class ModelSymmetry:
             lines.append("")
             for row in (header, *rows):
                 lines.append("  ".join(f"{c:<{w}s}" for c, w in zip(row, widths, strict=True)).rstrip())
+        for name in self.group.names[1:]:
+            shifted = ", ".join(f"{joint} {offset:+.4g}" for joint, offset in self.offsets(name).items())
+            lines += [f"offsets of positions under {name}: {shifted}"] * bool(shifted)
+        lines += [f"ambiguous: {sentence}" for sentence in self.ambiguous]
         return "\n".join(lines)

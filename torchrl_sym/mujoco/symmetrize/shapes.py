@@ -67,7 +67,7 @@ class _Geoms:
         self.averager, self.model, self.turns = averager, averager.model, averager.turns
         self.owner = self.model.body_weldid[self.model.geom_bodyid]
         self.links = [int(b) for b in self.owner]
-        moved = np.array([averager.moved[b] - averager.shift[b] for b in self.links]).reshape(-1, 3)
+        moved = np.array([averager.moved[b] for b in self.links]).reshape(-1, 3)
         self.centers = averager.data.geom_xpos + moved
         self.offsets = self.centers - np.array([averager.origin[b] for b in self.links]).reshape(-1, 3)
         self.frames = averager.data.geom_xmat.reshape(-1, 3, 3)
