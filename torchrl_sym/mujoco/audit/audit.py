@@ -18,11 +18,12 @@ from torchrl_sym.mujoco.audit.actuators import compare_actuators
 from torchrl_sym.mujoco.audit.bodies import compare_fluid, compare_links
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.equalities import compare_equalities
-from torchrl_sym.mujoco.audit.geoms import audit_geoms
+from torchrl_sym.mujoco.audit.filters import compare_contacts
 from torchrl_sym.mujoco.audit.joints import compare_dofs, compare_joints
 from torchrl_sym.mujoco.audit.report import AuditReport, Residual, phrase
+from torchrl_sym.mujoco.audit.shapes import compare_shapes
 from torchrl_sym.mujoco.audit.simulation import simulation_warnings, unchecked_elements
-from torchrl_sym.mujoco.audit.sites import audit_sites
+from torchrl_sym.mujoco.audit.sites import compare_sites
 from torchrl_sym.mujoco.audit.tendons import compare_tendons
 from torchrl_sym.mujoco.derive.derive import derive
 from torchrl_sym.mujoco.model.links import carried_bodies
@@ -100,5 +101,5 @@ def _compare(c: Comparison) -> list[str]:
     compare_tendons(c)
     compare_equalities(c)
     compare_fluid(c)
-    audit_geoms(c.model, c.data, c.matcher, c.map.bodies, c.add)
-    return audit_sites(c.model, c.data, c.matcher, c.map.bodies, c.add)
+    compare_contacts(c, compare_shapes(c))
+    return compare_sites(c)

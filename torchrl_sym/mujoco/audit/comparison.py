@@ -23,7 +23,7 @@ class Comparison:
         self.worst: dict[str, tuple[float, str]] = {}
         self.unchecked: list[str] = []
 
-    def add(self, term: str, residual: float, name: str) -> None:
+    def add(self, term: str, residual: float, name: str, kind: str = "dynamics") -> None:
         """Keep the worst part of each term."""
         if term not in self.worst or residual > self.worst[term][0]:
             self.worst[term] = (residual, name)
