@@ -80,7 +80,9 @@ def audit(
     for g, name in enumerate(elements, start=1):
         run = Comparison(symmetry, g)
         loose |= dict.fromkeys(_compare(run))
-        rows += [Residual(name, term, worst, part) for term, (worst, part) in run.worst.items()]
+        rows += [
+            Residual(name, term, worst, part, run.kinds[term]) for term, (worst, part) in run.worst.items()
+        ]
         unchecked += tuple(text for text in run.unchecked if text not in unchecked)
     if loose:
         shown = ", ".join(list(loose)[:4]) + ", ..." * (len(loose) > 4)

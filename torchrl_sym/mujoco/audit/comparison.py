@@ -21,12 +21,13 @@ class Comparison:
         self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
         self.worst: dict[str, tuple[float, str]] = {}
+        self.kinds: dict[str, str] = {}
         self.unchecked: list[str] = []
 
     def add(self, term: str, residual: float, name: str, kind: str = "dynamics") -> None:
         """Keep the worst part of each term."""
         if term not in self.worst or residual > self.worst[term][0]:
-            self.worst[term] = (residual, name)
+            self.worst[term], self.kinds[term] = (residual, name), kind
 
     def name(self, kind: str, a: int, b: int) -> str:
         name = name_of(self.model, kind, a)

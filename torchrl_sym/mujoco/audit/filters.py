@@ -85,29 +85,29 @@ def _compare_filters(c: Comparison, mine: NDArray[np.intp], theirs: NDArray[np.i
         if table.any():
             c.add(term, 0.0, "", kind="collision")
 
-    ends = np.stack([filters.of[mine], filters.of[theirs]], axis=1)
-    (one, other), first = (x.T for x in np.unique(ends, axis=0, return_index=True))
+    moves = np.stack([filters.of[mine], filters.of[theirs]], axis=1)
+    (one, other), first = (x.T for x in np.unique(moves, axis=0, return_index=True))
     may, encounters = filters.may, Encounters(model, c.data, filters.of, filters.body)
     wrong = may[np.ix_(one, one)] != may[np.ix_(other, other)]
-    for i, j in np.argwhere(np.triu(wrong)):
-        here = bool(may[one[i], one[j]])
-        ends = one if here else other
-        share = encounters.share(int(ends[i]), int(ends[j]))
-        names = " with ".join(geom_label(model, int(mine[first[k]])) for k in (i, j))
-        same = filters.alike[one[i], one[j]] == filters.alike[other[i], other[j]]
-        changed = (filters.bits[one[[i, j]]] != filters.bits[other[[i, j]]]).any(axis=1)
-        terrain = (changed & ~filters.moves[one[[i, j]]]).any() and changed.sum() == 1
-        c.add(
-            "excludes" if same else "scenery contype/conaffinity" if terrain else "contype/conaffinity",
-            max(share, DISCRETE),
-            f"{names} ({_story(here, share)})",
-            kind="scenery" if terrain else "collision",
-        )
+    for ends in np.argwhere(np.triu(wrong)):
+        before, after = one[ends], other[ends]
+        here = bool(may[before[0], before[1]])
+        share = encounters.share(*map(int, before if here else after))
+        names = " with ".join(geom_label(model, int(geom)) for geom in mine[first[ends]])
+        who = "may touch, their images may not" if here else "may not touch, their images may"
+        name = f"{names} ({who}, and do in {share:.0%} of poses)"
+        bits_agree = filters.alike[before[0], before[1]] == filters.alike[after[0], after[1]]
+        if _is_due_to_terrain(filters, before, after):
+            c.add("scenery filters", max(share, DISCRETE), name, kind="scenery")
+        else:
+            term = "excludes" if bits_agree else "contype/conaffinity"
+            c.add(term, max(share, DISCRETE), name, kind="collision")
 
 
-def _story(here: bool, share: float) -> str:
-    sides = "may touch, their images may not" if here else "may not touch, their images may"
-    return f"{sides}, and do in {share:.0%} of poses"
+def _is_due_to_terrain(filters: Filters, before: NDArray[np.intp], after: NDArray[np.intp]) -> bool:
+    """Whether of two classes of geoms only one has other bits than its image, and that is the world's."""
+    changed = (filters.bits[before] != filters.bits[after]).any(axis=1)
+    return bool(changed.sum() == 1 and not filters.moves[before[changed]].any())
 
 
 def _compare_pairs(c: Comparison, images: dict[int, int]) -> None:

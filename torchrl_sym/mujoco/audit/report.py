@@ -13,6 +13,7 @@ class Residual:
     term: str
     residual: float
     name: str
+    kind: str = "dynamics"
 
 
 @dataclass(frozen=True)
