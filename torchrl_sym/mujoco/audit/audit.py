@@ -18,11 +18,12 @@ from torchrl_sym.mujoco.audit.actuators import compare_actuators
 from torchrl_sym.mujoco.audit.bodies import compare_fluid, compare_links
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.equalities import compare_equalities
-from torchrl_sym.mujoco.audit.geoms import audit_geoms
+from torchrl_sym.mujoco.audit.filters import compare_contacts
 from torchrl_sym.mujoco.audit.joints import compare_dofs, compare_joints
 from torchrl_sym.mujoco.audit.report import AuditReport, Residual
+from torchrl_sym.mujoco.audit.shapes import compare_shapes
 from torchrl_sym.mujoco.audit.simulation import simulation_warnings, unchecked_elements
-from torchrl_sym.mujoco.audit.sites import audit_sites
+from torchrl_sym.mujoco.audit.sites import compare_sites
 from torchrl_sym.mujoco.audit.tendons import compare_tendons
 from torchrl_sym.mujoco.derive.derive import derive
 from torchrl_sym.mujoco.model.links import carried_bodies
@@ -34,6 +35,7 @@ def audit(
     group: PointGroup,
     keyframe: int | str | None = None,
     *,
+    axis: tuple[float, float] | None = None,
     tolerance: float = 1e-8,
     carried: Sequence[str] = (),
 ) -> AuditReport:
@@ -41,8 +43,10 @@ def audit(
 
     Args:
         model: the compiled model.
-        group: the group to try; it acts about the vertical axis through the world's origin.
-        keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
+        group: the group to try; it acts about a vertical axis.
+        keyframe: a pose that the group keeps, by name or number. By default it is found, as in
+            :func:`~torchrl_sym.mujoco.derive`.
+        axis: where the vertical axis stands, (x, y) in metres. By default it is found.
         tolerance: largest residual that counts as exact.
         carried: names of bodies that a turn of the world only carries along, as in
             :func:`~torchrl_sym.mujoco.derive`; their shape and inertia need no symmetry.
@@ -67,7 +71,7 @@ def audit(
     elements = tuple(group.names[1:])
     warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
     try:
-        symmetry = derive(model, group, keyframe, carried=carried)
+        symmetry = derive(model, group, keyframe, axis=axis, carried=carried)
     except ValueError as error:  # SymmetryError, or a group that tilts gravity or does not close
         return AuditReport(elements, (), tolerance, str(error), "no", warnings, unchecked)
     rows: list[Residual] = []
@@ -93,5 +97,5 @@ def _compare(c: Comparison) -> list[str]:
     compare_tendons(c)
     compare_equalities(c)
     compare_fluid(c)
-    audit_geoms(c.model, c.data, c.matcher, c.map.bodies, c.add)
-    return audit_sites(c.model, c.data, c.matcher, c.map.bodies, c.add)
+    compare_contacts(c, compare_shapes(c))
+    return compare_sites(c)

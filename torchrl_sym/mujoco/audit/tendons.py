@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from torchrl_sym.mujoco.audit.comparison import Comparison
-from torchrl_sym.mujoco.audit.geoms import shape_residual
-from torchrl_sym.mujoco.derive.matching import Matcher
-from torchrl_sym.mujoco.model.types import MjData, MjModel, mj
+from torchrl_sym.mujoco.audit.shapes import shape_residual
+from torchrl_sym.mujoco.audit.sites import side_residual
+from torchrl_sym.mujoco.model.types import mj
 
 
 def compare_tendons(c: Comparison) -> None:
@@ -23,7 +23,7 @@ def compare_tendons(c: Comparison) -> None:
                 factor = sign * c.map.signs[joint] * float(model.wrap_prm[k])
                 shift += factor * c.map.offsets[joint]
         else:
-            c.add("tendon path", path_residual(model, c.data, c.matcher, t, u), name)
+            c.add("tendon path", path_residual(c, t, u), name)
         c.range("tendon range", "tendon_range", "tendon_limited", t, u, sign, shift, name)
         c.range("tendon range", "tendon_actfrcrange", "tendon_actfrclimited", t, u, sign, 0.0, name)
         if model.tendon_stiffness[t] > 0:
@@ -41,8 +41,9 @@ def compare_tendons(c: Comparison) -> None:
             c.fields(term, [f"tendon_{field}" for field in fields], t, u, name)
 
 
-def path_residual(model: MjModel, data: MjData, matcher: Matcher, t: int, u: int) -> float:
-    """Wrapping geoms and pulleys of spatial tendon t against those of u, in the better direction."""
+def path_residual(c: Comparison, t: int, u: int) -> float:
+    """Wraps, their sides and pulleys of spatial tendon t against those of u, in the better direction."""
+    model = c.model
     a, b, count = int(model.tendon_adr[t]), int(model.tendon_adr[u]), int(model.tendon_num[t])
 
     def residual(order: Iterable[int]) -> float:
@@ -52,7 +53,8 @@ def path_residual(model: MjModel, data: MjData, matcher: Matcher, t: int, u: int
             if kind != int(model.wrap_type[b + m]):
                 return 1.0
             if kind in (int(mj.mjtWrap.mjWRAP_SPHERE), int(mj.mjtWrap.mjWRAP_CYLINDER)):
-                worst = max(worst, shape_residual(model, data, matcher, int(objects[0]), int(objects[1])))
+                shape = shape_residual(c, int(objects[0]), int(objects[1]))
+                worst = max(worst, shape, side_residual(c, a + k, b + m))
             elif kind == int(mj.mjtWrap.mjWRAP_PULLEY):
                 worst = max(worst, abs(float(model.wrap_prm[a + k] - model.wrap_prm[b + m])))
         return min(worst, 1.0)

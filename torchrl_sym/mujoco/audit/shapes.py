@@ -1,0 +1,178 @@
+"""Are shapes mapped onto each other, those that may touch something or feel a fluid?
+
+Each geom of a link is paired with the nearest one of its kind on the link's image. Where that fails, the
+surfaces decide: a geom that others cover, because it is there twice or is cut into other pieces on the
+other side, changes contacts a little and is no asymmetry of the robot; one that sticks out is. Shapes of
+the world are *scenery*: a robot does not lose its symmetry by the wall it stands beside, but a task on that
+terrain does.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_sym.mujoco.audit.comparison import Comparison
+from torchrl_sym.mujoco.audit.pairing import pair
+from torchrl_sym.mujoco.model.filters import active_geoms, feels_fluid, geom_label, lonely_geoms
+from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, SOLID, geom_supports
+from torchrl_sym.mujoco.model.surfaces import outside, surface_points
+from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, name_of
+
+# What no number measures: other pieces of one surface, a filter between parts that do not meet.
+DISCRETE = 1e-2
+_STICKS_OUT = 0.1  # of its bounding radius: by so much a geom that others cover may reach beyond them
+_TERMS = {"collision": "collision geometry", "scenery": "scenery geometry", "dynamics": "fluid geometry"}
+
+Numbers = NDArray[np.intp]
+
+
+@dataclass
+class Shapes:
+    """Compared geoms, and where they go.
+
+    Attributes:
+        geoms: numbers of the geoms, ``(n,)``.
+        kinds: what each is judged as: collision, scenery or dynamics.
+        mine: support functions of their images, relative to the scale, ``(n, d)``.
+        theirs: support functions where images are looked for, ``(n, d)``.
+        images: which of ``geoms`` each goes to, -1 for none.
+        gaps: largest distance of each image from the geom that it goes to, infinite for none.
+    """
+
+    geoms: Numbers
+    kinds: NDArray[np.str_]
+    mine: Array
+    theirs: Array
+    images: Numbers
+    gaps: Array
+
+
+def compare_shapes(c: Comparison) -> dict[int, int]:
+    """Residuals of shapes; returns the image of every geom that has one."""
+    model, lonely = c.model, lonely_geoms(c.model)
+    geoms = np.union1d(active_geoms(model), lonely)
+    if not len(geoms):
+        return {}
+    if len(lonely):
+        names = ", ".join(geom_label(model, int(g)) for g in lonely[:2]) + ", ..." * (len(lonely) > 2)
+        c.unchecked.append(
+            f"contacts of {len(lonely)} geoms ({names}): nothing in this file can touch them, only their "
+            "shapes were compared; audit the scene with the floor"
+        )
+    world = model.body_weldid[model.geom_bodyid[geoms]] == 0
+    kinds = np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision"))
+    turn, extent = c.matcher.matrix, c.matcher.extent
+    s = Shapes(
+        geoms,
+        kinds,
+        _features(model, c.data, geoms, turn, extent),
+        _features(model, c.image, geoms, np.eye(3), extent),
+        np.full(len(geoms), -1),
+        np.full(len(geoms), np.inf),
+    )
+
+    places = _places(model, geoms)
+    for link, image in c.map.bodies.items():
+        _pair_link(model, s, places.get(link, {}), places.get(image, {}))
+        _cover_link(c, s, places.get(link, {}), places.get(image, {}))
+    for kind, term in _TERMS.items():
+        some = np.flatnonzero(kinds == kind)
+        if len(some):
+            worst = int(some[np.argmax(s.gaps[some])])
+            c.add(term, min(float(s.gaps[worst]), 1.0), _name(c, s, worst), kind=kind)
+    return {int(geoms[i]): int(geoms[k]) for i, k in enumerate(s.images) if k >= 0}
+
+
+def shape_residual(c: Comparison, a: int, b: int) -> float:
+    """Largest distance between the image of geom a and geom b, relative; infinite if their kinds differ."""
+    if c.model.geom_type[a] != c.model.geom_type[b]:
+        return np.inf
+    extent = c.matcher.extent
+    one = _features(c.model, c.data, np.array([a]), c.matcher.matrix, extent)
+    return float(np.abs(one - _features(c.model, c.image, np.array([b]), np.eye(3), extent)).max())
+
+
+def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, extent: float) -> Array:
+    """Support functions of the images of geoms, relative to a scale; of planes, normal and height."""
+    out = geom_supports(model, pose, geoms, DIRECTIONS @ turn) / extent
+    planes = np.flatnonzero(model.geom_type[geoms] == PLANE)
+    normals = pose.geom_xmat[geoms[planes]].reshape(-1, 3, 3)[:, :, 2]
+    out[planes, :3] = normals @ turn.T
+    out[planes, 3] = (normals * pose.geom_xpos[geoms[planes]]).sum(axis=1) / extent
+    return out
+
+
+def _places(model: MjModel, geoms: Numbers) -> dict[int, dict[int, Numbers]]:
+    """Where the geoms of each link are in an array of geoms, by their types."""
+    owner, places = model.body_weldid[model.geom_bodyid[geoms]], defaultdict(lambda: defaultdict(list))
+    for i, (link, kind) in enumerate(zip(owner.tolist(), model.geom_type[geoms].tolist(), strict=True)):
+        places[link][kind].append(i)
+    return {link: {kind: np.array(some) for kind, some in kinds.items()} for link, kinds in places.items()}
+
+
+def _pair_link(model: MjModel, s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:
+    """Pair each geom of a link with one of its kind on the link's image."""
+    for kind, rows in mine.items():
+        columns = theirs.get(kind, np.array([], dtype=np.intp))
+        one, other = pair(s.mine[rows], s.theirs[columns], s.geoms[rows], s.geoms[columns])
+        one, other = rows[one], columns[other]
+        s.images[one] = other
+        s.gaps[one] = np.abs(s.mine[one] - s.theirs[other]).max(axis=1, initial=0.0)
+
+
+def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:
+    """Ask the surfaces about geoms that have no image of their own, the worst first.
+
+    Once one sticks out, nothing that follows is worse. A fluid acts on every geom, so that there pieces are
+    no remedy.
+    """
+    none = np.array([], dtype=np.intp)
+    rest, cover = (
+        np.concatenate([none, *(some[k] for k in SOLID if k in some)]) for some in (mine, theirs)
+    )
+    rest = rest[(s.gaps[rest] > DISCRETE) & (s.kinds[rest] != "dynamics")]
+    for i in rest[np.argsort(-s.gaps[rest], kind="stable")]:
+        geom = int(s.geoms[i])
+        reach = _reach(c, geom, s.geoms[cover])
+        if reach > _STICKS_OUT * c.model.geom_rbound[geom] or reach / c.matcher.extent > s.gaps[i] / 2:
+            return
+        s.gaps[i] = reach / c.matcher.extent
+        nearest = cover[np.abs(s.theirs[cover] - s.mine[i]).max(axis=1).argmin()]
+        if s.images[i] < 0:
+            s.images[i] = nearest  # whose contact parameters it must have
+        body = name_of(c.model, "body", int(c.model.geom_bodyid[s.geoms[nearest]]))
+        name = f"{geom_label(c.model, geom)} (no single image, but geoms of {body!r} cover it)"
+        kind = str(s.kinds[i])
+        c.add(f"{kind} pieces", DISCRETE, name, kind=kind)
+
+
+def _reach(c: Comparison, geom: int, others: Numbers) -> float:
+    """How far the image of a geom sticks out of some others; infinite if it meets none of them."""
+    model, turn = c.model, c.matcher.matrix
+    apart = np.linalg.norm(c.image.geom_xpos[others] - turn @ c.data.geom_xpos[geom], axis=1)
+    near = others[apart <= model.geom_rbound[geom] + model.geom_rbound[others]]
+    if not len(near):
+        return np.inf
+    points = surface_points(model, c.data, geom) @ turn.T
+    return float(np.min([outside(model, c.image, int(b), points) for b in near], axis=0).max())
+
+
+def _name(c: Comparison, s: Shapes, i: int) -> str:
+    """Which geom goes where, or which one is nearest and how far."""
+    geom = int(s.geoms[i])
+    label = geom_label(c.model, geom)
+    if s.images[i] >= 0:
+        other = int(s.geoms[s.images[i]])
+        return label if other == geom else f"{label} -> {geom_label(c.model, other)}"
+    link = c.map.bodies[int(c.model.body_weldid[c.model.geom_bodyid[geom]])]
+    owner = c.model.body_weldid[c.model.geom_bodyid[s.geoms]]
+    candidates = np.flatnonzero((owner == link) & (c.model.geom_type[s.geoms] == c.model.geom_type[geom]))
+    if not len(candidates):
+        return f"{label} (no image)"
+    gaps = np.abs(s.theirs[candidates] - s.mine[i]).max(axis=1)
+    nearest = geom_label(c.model, int(s.geoms[candidates[gaps.argmin()]]))
+    return f"{label} (no image; {nearest} is nearest, {1e3 * c.matcher.extent * gaps.min():.3g} mm off)"
