@@ -33,8 +33,8 @@ class Arguments:
     model: Annotated[Path, tyro.conf.Positional]
     """An MJCF or URDF file."""
     group: str | None = None
-    """Try this group only: reflect-x (front and back), reflect-y (left and right), reflect-30 (the angle of the
-    mirror's normal from x, in degrees), klein_four, rotation-N or dihedral-N. By default all are tried."""
+    """Try this group only: reflect-x (front and back), reflect-y (left and right), reflect-30 (the angle of
+    the mirror's normal from x, in degrees), klein_four, rotation-N or dihedral-N. Default: try all."""
     plane: float = 0.0
     """Degrees by which the mirror planes of --group are turned about the vertical axis."""
     keyframe: str | None = None

@@ -78,7 +78,7 @@ class AuditReport:
 
     @property
     def reason(self) -> str | None:
-        """Why the model lacks the symmetry, or one cannot tell; None if it has it at least approximately."""
+        """Why the model lacks the symmetry, or one cannot tell; None if it has it, at least nearly."""
         if self.outcome in ("exact", "approximate"):
             return None
         return self.refusal if self.refusal is not None else str(self.worst)

@@ -2,8 +2,8 @@
 
 The isometries that keep the vertical axis are its turns and the mirrors in planes through it. A finite set
 of them that is closed is C_n (the n turns by 360/n degrees) or D_n (these and n mirrors), so it is enough
-to know the largest n and one mirror. A turn by 360/12 contains those by 360/2, 360/3, 360/4 and 360/6: where a
-turn of prime order fails, its multiples need not be tried. Mirror planes are proposed by the links
+to know the largest n and one mirror. Turns by 360/12 contain those by 360/2, 360/3, 360/4 and 360/6: where
+an order fails, its multiples need not be tried. Mirror planes are proposed by the links
 (:mod:`~torchrl_sym.mujoco.symmetries.planes`).
 """
 
