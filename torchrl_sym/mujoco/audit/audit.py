@@ -15,19 +15,24 @@ from collections.abc import Sequence
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.mujoco.audit.actuators import compare_actuators
-from torchrl_sym.mujoco.audit.bodies import compare_fluid, compare_links
+from torchrl_sym.mujoco.audit.bodies import compare_fluid, compare_gravity, compare_links
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.equalities import compare_equalities
 from torchrl_sym.mujoco.audit.filters import compare_contacts
-from torchrl_sym.mujoco.audit.joints import compare_dofs, compare_joints
+from torchrl_sym.mujoco.audit.joints import compare_constraint_weights, compare_dofs, compare_joints
 from torchrl_sym.mujoco.audit.report import AuditReport, Residual
+from torchrl_sym.mujoco.audit.scales import efforts_of
 from torchrl_sym.mujoco.audit.shapes import compare_shapes
 from torchrl_sym.mujoco.audit.simulation import simulation_warnings, unchecked_elements
 from torchrl_sym.mujoco.audit.sites import compare_sites
 from torchrl_sym.mujoco.audit.tendons import compare_tendons
-from torchrl_sym.mujoco.derive.derive import derive
-from torchrl_sym.mujoco.model.links import carried_bodies
+from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
 from torchrl_sym.mujoco.model.types import MjModel, check_model
+
+_STILL = (
+    "nothing in the model can move; a robot whose root is nailed to the world, as every URDF's is, needs a "
+    "free joint: --free-base on the command line, or <freejoint/> in its body"
+)
 
 
 def audit(
@@ -65,22 +70,42 @@ def audit(
         >>> audit(model, PointGroup.reflection("y")).verdict
         'approximate (largest residual 0.02: inertia, reflect-y, ...)'
     """
-    # a mistake of the call is no finding about the model
-    carried_bodies(check_model(model), carried)
+    check_model(model)
     tolerance, group = checks.real("tolerance", tolerance, 0.0), check_group(group)
-    elements = tuple(group.names[1:])
-    warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
     try:
         symmetry = derive(model, group, keyframe, axis=axis, carried=carried)
-    except ValueError as error:  # SymmetryError, or a group that tilts gravity or does not close
-        return AuditReport(elements, (), tolerance, str(error), "no", warnings, unchecked)
+    except SymmetryError as error:
+        return refused(model, group, tolerance, str(error))
+    return audit_derived(symmetry, tolerance)
+
+
+def refused(model: MjModel, group: PointGroup, tolerance: float, reason: str) -> AuditReport:
+    """The report on a group of which an element has no images."""
+    elements = tuple(group.names[1:])
+    if not can_move(model):
+        return AuditReport(elements, (), tolerance, _STILL, "nothing")
+    warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
+    return AuditReport(elements, (), tolerance, reason, "no", warnings, unchecked)
+
+
+def audit_derived(symmetry: ModelSymmetry, tolerance: float) -> AuditReport:
+    """The report on a symmetry that has been derived."""
+    model, group = symmetry.model, symmetry.group
+    elements = tuple(group.names[1:])
+    if not can_move(model):
+        return AuditReport(elements, (), tolerance, _STILL, "nothing")
+    warnings, unchecked = simulation_warnings(model, group), unchecked_elements(model)
+    matcher = symmetry.actions[0].matcher
+    efforts = efforts_of(model, matcher.data, matcher.extent)
+
     rows: list[Residual] = []
     loose: dict[str, None] = {}
     for g in range(1, group.order):
-        run = Comparison(symmetry, g)
+        run = Comparison(symmetry, g, efforts)
         loose |= dict.fromkeys(_compare(run))
         rows += run.worst.values()
         unchecked += tuple(text for text in run.unchecked if text not in unchecked)
+        warnings += tuple(text for text in run.warnings if text not in warnings)
     if loose:
         shown = ", ".join(list(loose)[:4]) + ", ..." * (len(loose) > 4)
         text = f"{len(loose)} sites are out of place ({shown}); nothing in the model uses them, so do not"
@@ -88,8 +113,14 @@ def audit(
     return AuditReport(elements, tuple(rows), tolerance, warnings=warnings, unchecked=unchecked)
 
 
+def can_move(model: MjModel) -> bool:
+    """Whether anything in a model can move."""
+    return model.nv > 0 or model.nmocap > 0
+
+
 def _compare(c: Comparison) -> list[str]:
     """Run all comparisons; returns the unused sites that are out of place."""
+    compare_gravity(c)
     compare_links(c)
     compare_joints(c)
     compare_dofs(c)
@@ -98,4 +129,6 @@ def _compare(c: Comparison) -> list[str]:
     compare_equalities(c)
     compare_fluid(c)
     compare_contacts(c, compare_shapes(c))
-    return compare_sites(c)
+    loose = compare_sites(c)
+    compare_constraint_weights(c)
+    return loose

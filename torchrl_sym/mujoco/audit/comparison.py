@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sym.mujoco.audit.report import Kind, Residual
+from torchrl_sym.mujoco.audit.scales import Efforts
 from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
 from torchrl_sym.mujoco.model.links import links_of
 from torchrl_sym.mujoco.model.types import Array, name_of
@@ -14,16 +15,17 @@ from torchrl_sym.mujoco.model.types import Array, name_of
 class Comparison:
     """Compares everything in a model with its image under one element; ``worst`` holds the outcome."""
 
-    def __init__(self, symmetry: ModelSymmetry, g: int) -> None:
+    def __init__(self, symmetry: ModelSymmetry, g: int, efforts: Efforts) -> None:
         self.model, self.action = symmetry.model, symmetry.actions[g]
         self.matcher = self.action.matcher
         self.data, self.image = self.matcher.data, self.matcher.image
         self.links = self.matcher.links
         self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
-        self.element = symmetry.group.names[g]
+        self.element, self.efforts = symmetry.group.names[g], efforts
         self.worst: dict[str, Residual] = {}
         self.unchecked: list[str] = []
+        self.warnings: list[str] = []
 
     def add(self, term: str, residual: float, name: str, kind: Kind = "dynamics", amount: str = "") -> None:
         """Keep the worst part of each term."""

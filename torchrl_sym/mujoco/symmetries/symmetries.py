@@ -16,8 +16,9 @@ import numpy as np
 
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.audit import AuditReport, audit
-from torchrl_sym.mujoco.derive import ModelSymmetry, derive
+from torchrl_sym.mujoco.audit import AuditReport
+from torchrl_sym.mujoco.audit.audit import audit_derived, refused
+from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
 from torchrl_sym.mujoco.model.poses import reference_pose
 from torchrl_sym.mujoco.model.types import MjModel, check_model
 from torchrl_sym.mujoco.symmetries.planes import candidate_planes
@@ -25,6 +26,7 @@ from torchrl_sym.mujoco.symmetries.report import Candidate, SymmetriesReport
 
 MOST_FOLD = 12
 _USUAL_FOLD = 4  # half, third and quarter turns are reported even where they fail
+_TURNED = "turned by"  # in the words for a pose: a free base was turned to suit the group
 _SAME_PLANE = 0.5  # degrees; candidate planes nearer than this to one that was found are that one
 
 
@@ -70,10 +72,11 @@ def symmetries(
 
     pose, place = "", (0.0, 0.0)
     if group.order > 1:
-        robot = search.derive(group)
+        robot, _ = search.look(group)
+        assert robot is not None
         pose, place = robot.pose, robot.axis
     return SymmetriesReport(
-        tuple(search.tried.values()), group, exact_group, search.audit(group), pose, place
+        tuple(search.tried.values()), group, exact_group, search.look(group)[1], pose, place
     )
 
 
@@ -87,26 +90,32 @@ class _Search:
     tolerance: float
     carried: tuple[str, ...]
     tried: dict[str, Candidate] = field(default_factory=dict)
+    known: dict[PointGroup, tuple[ModelSymmetry | None, AuditReport]] = field(default_factory=dict)
 
-    def audit(self, group: PointGroup) -> AuditReport:
-        return audit(
-            self.model,
-            group,
-            self.keyframe,
-            axis=self.axis,
-            tolerance=self.tolerance,
-            carried=self.carried,
-        )
+    def look(self, group: PointGroup) -> tuple[ModelSymmetry | None, AuditReport]:
+        """What a group does to the model, None if it has no images, and the audit."""
+        if group not in self.known:
+            self.known[group] = self._look(group)
+        return self.known[group]
 
-    def derive(self, group: PointGroup) -> ModelSymmetry:
-        return derive(self.model, group, self.keyframe, axis=self.axis, carried=self.carried)
+    def _look(self, group: PointGroup) -> tuple[ModelSymmetry | None, AuditReport]:
+        try:
+            robot = derive(self.model, group, self.keyframe, axis=self.axis, carried=self.carried)
+        except SymmetryError as error:
+            return None, refused(self.model, group, self.tolerance, str(error))
+        return robot, audit_derived(robot, self.tolerance)
 
     def examine(self, group: PointGroup, usual: bool) -> Candidate:
         """Audit the group that an element generates; elements that people ask for are reported always."""
-        name, report = group.names[1], self.audit(group)
-        found = report.outcome in ("exact", "approximate")
-        candidate = Candidate(name, report, found and _moves(self.derive(group), 1))
-        if found or usual:
+        (robot, report), name, moves = self.look(group), group.names[1], False
+        if robot is not None and report.outcome in ("exact", "approximate"):
+            if _TURNED in robot.pose:  # it is another plane of the robot's own frame, and is tried there
+                reason = f"only with the base turned: {robot.pose}"
+                report = AuditReport(report.elements, (), self.tolerance, reason)
+            else:
+                moves = _moves(robot, 1)
+        candidate = Candidate(name, report, moves)
+        if candidate.found or usual:
             self.tried[name] = candidate
         return candidate
 
@@ -143,8 +152,9 @@ class _Search:
         groups += [PointGroup.rotation(n) for n in folds]
         groups += [PointGroup.reflection(angle) for angle in angles]
         for group in sorted(groups, key=lambda group: -group.order):
-            if self.audit(group).outcome in outcomes:
-                faithful = _faithful(group, self.derive(group))
+            robot, report = self.look(group)
+            if robot is not None and report.outcome in outcomes:
+                faithful = _faithful(group, robot)
                 if faithful.order > 1:
                     return faithful
         return PointGroup.trivial()
