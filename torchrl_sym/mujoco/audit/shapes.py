@@ -39,7 +39,7 @@ class Shapes:
         kinds: what each is judged as: collision, scenery or dynamics.
         mine: support functions of their images, relative to the scale, ``(n, d)``.
         theirs: support functions where images are looked for, ``(n, d)``.
-        images: which of ``geoms`` each goes to, -1 for none.
+        images: numbers of the geoms that they go to, -1 for none.
         gaps: largest distance of each image from the geom that it goes to, infinite for none.
     """
 
@@ -58,33 +58,46 @@ def compare_shapes(c: Comparison) -> dict[int, int]:
     if not len(geoms):
         return {}
     if len(lonely):
-        names = ", ".join(geom_label(model, int(g)) for g in lonely[:2]) + ", ..." * (len(lonely) > 2)
-        c.unchecked.append(
-            f"contacts of {len(lonely)} geoms ({names}): nothing in this file can touch them, only their "
-            "shapes were compared; audit the scene with the floor"
-        )
+        c.unchecked.append(_untouched(model, lonely))
+
+    s, places = _shapes(c, geoms), _places(model, geoms)
+    others = np.setdiff1d(np.arange(model.ngeom), geoms)
+    idle = _places(model, others)
+    for link, image in c.map.bodies.items():
+        mine, theirs = places.get(link, {}), places.get(image, {})
+        _pair_link(s, mine, theirs)
+        _look_among(c, s, mine, {kind: others[k] for kind, k in idle.get(image, {}).items()})
+        _cover_link(c, s, mine, theirs)
+
+    for kind, term in _TERMS.items():
+        some = np.flatnonzero(s.kinds == kind)
+        if len(some):
+            worst = int(some[np.argmax(s.gaps[some])])
+            c.add(term, min(float(s.gaps[worst]), 1.0), _name(c, s, worst), kind=kind)
+    return {int(a): int(b) for a, b in zip(geoms, s.images, strict=True) if b >= 0}
+
+
+def _untouched(model: MjModel, lonely: Numbers) -> str:
+    """What is said of geoms that nothing in the file can touch."""
+    count = f"{len(lonely)} geom" + "s" * (len(lonely) > 1)
+    names = ", ".join(geom_label(model, int(g)) for g in lonely[:2]) + ", ..." * (len(lonely) > 2)
+    return (
+        f"contacts of {count} ({names}): nothing in this file can touch them, only their shapes were "
+        "compared; audit the scene with the floor"
+    )
+
+
+def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
+    model, turn, extent = c.model, c.matcher.matrix, c.matcher.extent
     world = model.body_weldid[model.geom_bodyid[geoms]] == 0
-    kinds = np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision"))
-    turn, extent = c.matcher.matrix, c.matcher.extent
-    s = Shapes(
+    return Shapes(
         geoms,
-        kinds,
+        np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision")),
         _features(model, c.data, geoms, turn, extent),
         _features(model, c.image, geoms, np.eye(3), extent),
         np.full(len(geoms), -1),
         np.full(len(geoms), np.inf),
     )
-
-    places = _places(model, geoms)
-    for link, image in c.map.bodies.items():
-        _pair_link(model, s, places.get(link, {}), places.get(image, {}))
-        _cover_link(c, s, places.get(link, {}), places.get(image, {}))
-    for kind, term in _TERMS.items():
-        some = np.flatnonzero(kinds == kind)
-        if len(some):
-            worst = int(some[np.argmax(s.gaps[some])])
-            c.add(term, min(float(s.gaps[worst]), 1.0), _name(c, s, worst), kind=kind)
-    return {int(geoms[i]): int(geoms[k]) for i, k in enumerate(s.images) if k >= 0}
 
 
 def shape_residual(c: Comparison, a: int, b: int) -> float:
@@ -114,14 +127,26 @@ def _places(model: MjModel, geoms: Numbers) -> dict[int, dict[int, Numbers]]:
     return {link: {kind: np.array(some) for kind, some in kinds.items()} for link, kinds in places.items()}
 
 
-def _pair_link(model: MjModel, s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:
+def _pair_link(s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:
     """Pair each geom of a link with one of its kind on the link's image."""
     for kind, rows in mine.items():
         columns = theirs.get(kind, np.array([], dtype=np.intp))
         one, other = pair(s.mine[rows], s.theirs[columns], s.geoms[rows], s.geoms[columns])
         one, other = rows[one], columns[other]
-        s.images[one] = other
+        s.images[one] = s.geoms[other]
         s.gaps[one] = np.abs(s.mine[one] - s.theirs[other]).max(axis=1, initial=0.0)
+
+
+def _look_among(c: Comparison, s: Shapes, mine: dict[int, Numbers], idle: dict[int, Numbers]) -> None:
+    """Look for images among geoms that can touch nothing: there it is the filters that differ."""
+    for kind, rows in mine.items():
+        rest = rows[s.gaps[rows] > DISCRETE]
+        if len(rest) and kind in idle:
+            there = _features(c.model, c.image, idle[kind], np.eye(3), c.matcher.extent)
+            one, other = pair(s.mine[rest], there, s.geoms[rest], idle[kind])
+            gaps = np.abs(s.mine[rest[one]] - there[other]).max(axis=1)
+            fit = gaps <= DISCRETE
+            s.images[rest[one[fit]]], s.gaps[rest[one[fit]]] = idle[kind][other[fit]], gaps[fit]
 
 
 def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:
@@ -143,7 +168,7 @@ def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict
         s.gaps[i] = reach / c.matcher.extent
         nearest = cover[np.abs(s.theirs[cover] - s.mine[i]).max(axis=1).argmin()]
         if s.images[i] < 0:
-            s.images[i] = nearest  # whose contact parameters it must have
+            s.images[i] = s.geoms[nearest]  # whose contact parameters it must have
         body = name_of(c.model, "body", int(c.model.geom_bodyid[s.geoms[nearest]]))
         name = f"{geom_label(c.model, geom)} (no single image, but geoms of {body!r} cover it)"
         kind = str(s.kinds[i])
@@ -165,8 +190,8 @@ def _name(c: Comparison, s: Shapes, i: int) -> str:
     """Which geom goes where, or which one is nearest and how far."""
     geom = int(s.geoms[i])
     label = geom_label(c.model, geom)
-    if s.images[i] >= 0:
-        other = int(s.geoms[s.images[i]])
+    other = int(s.images[i])
+    if other >= 0:
         return label if other == geom else f"{label} -> {geom_label(c.model, other)}"
     link = c.map.bodies[int(c.model.body_weldid[c.model.geom_bodyid[geom]])]
     owner = c.model.body_weldid[c.model.geom_bodyid[s.geoms]]
