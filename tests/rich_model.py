@@ -1,6 +1,8 @@
-"""A model with nearly every kind of element that MuJoCo knows, each with its mirror image under reflect-y."""
+"""A model with nearly every kind of element that MuJoCo knows, each with its image under reflect-y."""
 
 import mujoco
+
+# ruff: noqa: E501 (MJCF reads better in long lines)
 
 _SIDES = (("left", 1), ("right", -1))
 

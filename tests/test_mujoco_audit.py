@@ -150,7 +150,7 @@ def test_residuals_are_the_sizes_of_the_changes():
     assert worst(mass="1.1") == pytest.approx(0.1 / (4 + 4 * 0.5 + 3 * 1 + 1.1), rel=1e-9)
     assert worst(axis=SLANT) == pytest.approx(np.sin(np.radians(1)), rel=1e-6)
     assert worst(range="-.2 1") == pytest.approx(0.1 / 1.2, rel=1e-9)
-    assert worst(damping=".25") == pytest.approx(0.2, rel=1e-9)
+    assert worst(damping=".25") == pytest.approx(0.05 * 10 / (6 * 2), rel=1e-9)  # at 10 rad/s, of 12 N m
     assert worst(ctrlrange="-1 2.5") == pytest.approx(0.5 / 3.5, rel=1e-9)
 
 

@@ -63,7 +63,7 @@ class Comparison:
     ) -> None:
         """Model fields that must be equal, relative to the largest among elements of like units."""
         for field in fields:
-            values = np.asarray(getattr(self.model, field), dtype=float)
+            values = np.asarray(getattr(self.model, field, 0.0), dtype=float)  # some are new in 3.17
             if not values.any():
                 continue
             self.values(term, values.reshape(len(values), -1), i, j, name, alike)

@@ -31,10 +31,10 @@ def compare_joints(c: Comparison) -> None:
         c.range("joint range", "jnt_range", "jnt_limited", i, j, sign, shift, name)
         c.range("joint force range", "jnt_actfrcrange", "jnt_actfrclimited", i, j, sign, 0.0, name)
         same = np.flatnonzero(model.jnt_type == kind)
-        spring = float(
-            c.efforts.scale("stiffness", model.jnt_stiffness[model.dof_jntid])[model.jnt_dofadr[j]]
-        )
-        c.add("stiffness", abs(float(model.jnt_stiffness[i] - model.jnt_stiffness[j])) / spring, name)
+        spring = c.efforts.scale("stiffness", model.jnt_stiffness[model.dof_jntid])[model.jnt_dofadr[j]]
+        stiffness = model.jnt_stiffness[[i, j]] / spring
+        c.add("stiffness", float(abs(stiffness[0] - stiffness[1])), name)
+        c.fields("stiffness", ["jnt_stiffnesspoly"], i, j, name, same)
         c.fields("joint gravity compensation", ["jnt_actgravcomp"], i, j, name, same)
         if model.jnt_limited[i] or model.jnt_limited[j]:
             c.fields("joint solref/solimp", ["jnt_solref", "jnt_solimp", "jnt_margin"], i, j, name)
@@ -53,6 +53,8 @@ def compare_dofs(c: Comparison) -> None:
     tied = _tied_dofs(c)
     for term in ("damping", "armature", "frictionloss"):
         _compare_losses(c, term, np.array(getattr(model, f"dof_{term}")), tied)
+    for column in getattr(model, "dof_dampingpoly", np.zeros((model.nv, 0))).T:
+        _compare_losses(c, "damping", np.array(column), tied)
     for i, j in c.map.joints.items():
         a, b = int(model.jnt_dofadr[i]), int(model.jnt_dofadr[j])
         if model.dof_frictionloss[a] > 0:

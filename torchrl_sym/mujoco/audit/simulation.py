@@ -79,7 +79,5 @@ def unchecked_elements(model: MjModel) -> tuple[str, ...]:
     counts = {"plugins": model.nplugin, "flexes": model.nflex, "skins": model.nskin}
     out += [f"{count} {name}" for name, count in counts.items() if count]
     out += ["surface velocities of geoms"] * bool(np.any(model.geom_surfacevel))
-    polynomials = ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly", "tendon_dampingpoly")
-    out += [f"{field}" for field in polynomials if np.any(getattr(model, field, 0))]
     out += ["actuators with several controls"] * (getattr(model, "nactuator", model.nu) != model.nu)
     return tuple(out)

@@ -29,8 +29,8 @@ def compare_tendons(c: Comparison) -> None:
         if model.tendon_stiffness[t] > 0:
             c.range("tendon spring", "tendon_lengthspring", None, t, u, sign, shift, name)
         for term, fields in (
-            ("tendon spring", ["stiffness"]),
-            ("tendon damping", ["damping"]),
+            ("tendon spring", ["stiffness", "stiffnesspoly"]),
+            ("tendon damping", ["damping", "dampingpoly"]),
             ("tendon armature", ["armature"]),
             ("tendon frictionloss", ["frictionloss"]),
             (
