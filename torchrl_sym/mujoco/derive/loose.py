@@ -33,7 +33,7 @@ class Standing:
     images: list[dict[int, int]] = field(default_factory=list)
     words: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
-    misfit: float = 0.0
+    hopeless: bool = False  # whether a tree has joints on its first link without image, in any pose
 
 
 def stand(parts: Parts, group: PointGroup, origin: Array, tolerance: float) -> Standing:
@@ -61,9 +61,9 @@ def _stand_alike(
         names = ", ".join(label_of(model, "body", b) for b in alike)
         out.ambiguous.append(f"{names} are alike: each is taken for its own image")
     for b in alike:
-        misfit, words, turn, point = own[b] if own else _own(turning, b)
+        _, words, turn, point = own[b] if own else _own(turning, b)
+        out.hopeless |= not turning.is_rigid(b) and b not in turning.held
         out.turns[b], out.points[b] = turn, point
-        out.misfit = max(out.misfit, 0.0 if turning.is_rigid(b) else misfit)
         for images in out.images:
             images[b] = b
         if words != "as it is":
@@ -82,16 +82,17 @@ def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
 
     if any(attempt(turning, *usual, zero) for usual in turning.usual(tree)):
         return tried[-1]
-    least = min(tried, key=_misfit)[0]
-    more = turning.more(tree) if turning.is_object(tree) or least > 1 else ()
+    held = tree in turning.held
+    more = turning.more(tree) if turning.is_object(tree) or not held else ()
     if any(attempt(turning, *turn, zero) for turn in more):
         return tried[-1]
-    if min(tried, key=_misfit)[0] > 1:  # the frame may be anywhere in the body
+    if min(tried, key=_misfit)[0] > 1 and not held:  # the frame may be anywhere in the body
         for point in _points(turning, tree):
             about = turning.parts.about({tree: turning.parts.points[tree] + point})
             by = Turning(about, turning.matrices, turning.tolerance)
             if any(attempt(by, *usual, point) for usual in by.usual(tree)):
                 return tried[-1]
+            turning.held |= by.held
         if min(tried, key=_misfit)[0] > 1:
             tried = [t for t in tried if t[3] is zero]
     best = min(tried, key=_misfit)
@@ -137,7 +138,6 @@ def _exchange(
             for a, b in images[g].items()
         )
         if misfit <= 1:
-            out.misfit = max(out.misfit, misfit)
             out.turns |= {b: usual[b][k][1] for b in alike}
             out.points |= dict.fromkeys(alike, np.zeros(3))
             for g, own in enumerate(images):

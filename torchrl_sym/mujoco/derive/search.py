@@ -25,6 +25,7 @@ from torchrl_sym.mujoco.model.rotations import quaternion
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjModel, label_of
 
 _SNAP = 1e-2  # offsets below it (rad, or relative to a tree's size) are none, if the robot fits as well
+_RANGE = 0.1  # of their width, by which ranges may differ at a pose that was solved for
 
 
 @dataclass
@@ -88,12 +89,15 @@ class Search:
             tried.append(self._at(pose))
             if tried[-1].misfit <= 1:
                 return self._settled(tried[-1])
+            if tried[-1].standing.hopeless:
+                break
         best = min(tried, key=lambda stance: stance.misfit)
-        if keyframe is None and np.isfinite(best.misfit):
-            pose = solved(self.model, self.group, tried[0].pose, tried[0].axis, self.carried)
-            tried.append(self._at(pose))
-            if tried[-1].misfit <= 1:
-                return self._settled(tried[-1])
+        if keyframe is None and np.isfinite(best.misfit) and not best.standing.hopeless:
+            pose = solved(
+                self.model, self.group, tried[0].pose, tried[0].axis, self.carried, self.tolerance
+            )
+            if pose is not None and self._in_range(stance := self._at(pose)):
+                return self._settled(stance)
         self._refuse(tried)
 
     def _at(self, pose: Pose) -> Stance:
@@ -134,6 +138,14 @@ class Search:
                 start = int(model.jnt_qposadr[model.body_jntadr[b]])
                 qpos[start : start + 3], qpos[start + 3 : start + 7] = place, q
         return Pose(pose.words, qpos, mocap_pos, mocap_quat)
+
+    def _in_range(self, stance: Stance) -> bool:
+        """Whether a pose that was solved for fits, and sends ranges of joints to ranges."""
+        return stance.misfit <= 1 and all(
+            matcher.pairing.range_gap(i, j) <= _RANGE
+            for matcher in stance.matchers
+            for i, j in matcher.joints().items()
+        )
 
     def _settled(self, stance: Stance) -> Stance:
         """The stance at the pose's average over the group, if the robot fits there as well."""

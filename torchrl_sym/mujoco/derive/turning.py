@@ -21,6 +21,7 @@ from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, geom_supports
 from torchrl_sym.mujoco.model.types import Array, mj
 
+_FAR = 1e3  # misfit (in tolerances) where links have no image nearby
 _MOST = 24  # headings that are tried at most
 _NEAR = 0.1  # of a tree's size: farther from every other link, a link's image is no link
 _QUARTER = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # renames the axes
@@ -37,7 +38,8 @@ class Turning:
 
     def __init__(self, parts: Parts, matrices: Array, tolerance: float) -> None:
         self.parts, self.model, self.matrices, self.tolerance = parts, parts.model, matrices, tolerance
-        self._shapes: dict[int, tuple[Array, Array]] = {}
+        # trees whose first joints have images in some turn: then it is the pose, if others have none
+        self.held: set[int] = set()
 
     def usual(self, tree: int) -> list[tuple[str, Array]]:
         """Turns that are tried first, in words and as matrices: the same for all trees."""
@@ -95,9 +97,12 @@ class Turning:
     def _misfit(self, a: int, b: int, matrix: Array, acting: Array) -> float:
         if self.is_rigid(a) and self.is_rigid(b):
             return self._rigid(a, b, matrix)
-        if not self._near(a, b, matrix):
-            return np.inf
         pairing = Pairing(self.parts, matrix, acting)
+        if not pairing.holds(a, b, self.tolerance):
+            return np.inf
+        self.held.add(a)
+        if not self._near(a, b, matrix):
+            return _FAR
         return pairing.worst(pairing.images(a, b), self.tolerance).size
 
     def _near(self, a: int, b: int, matrix: Array) -> bool:
