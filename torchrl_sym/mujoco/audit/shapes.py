@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.pairing import pair
@@ -139,14 +140,18 @@ def _pair_link(s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) 
 
 def _look_among(c: Comparison, s: Shapes, mine: dict[int, Numbers], idle: dict[int, Numbers]) -> None:
     """Look for images among geoms that can touch nothing: there it is the filters that differ."""
-    for kind, rows in mine.items():
-        rest = rows[s.gaps[rows] > DISCRETE]
-        if len(rest) and kind in idle:
-            there = _features(c.model, c.image, idle[kind], np.eye(3), c.matcher.extent)
-            one, other = pair(s.mine[rest], there, s.geoms[rest], idle[kind])
-            gaps = np.abs(s.mine[rest[one]] - there[other]).max(axis=1)
-            fit = gaps <= DISCRETE
-            s.images[rest[one[fit]]], s.gaps[rest[one[fit]]] = idle[kind][other[fit]], gaps[fit]
+    for kind in mine.keys() & idle.keys():
+        rest, others = mine[kind][s.gaps[mine[kind]] > DISCRETE], idle[kind]
+        if not len(rest):
+            continue
+        centers = c.data.geom_xpos[s.geoms[rest]] @ c.matcher.matrix.T
+        apart = cKDTree(centers).query(c.image.geom_xpos[others])[0]
+        others = others[apart <= DISCRETE * c.matcher.extent]  # meshes for the eye are large
+        there = _features(c.model, c.image, others, np.eye(3), c.matcher.extent)
+        one, other = pair(s.mine[rest], there, s.geoms[rest], others)
+        gaps = np.abs(s.mine[rest[one]] - there[other]).max(axis=1, initial=0.0)
+        fit = gaps <= DISCRETE
+        s.images[rest[one[fit]]], s.gaps[rest[one[fit]]] = others[other[fit]], gaps[fit]
 
 
 def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) -> None:

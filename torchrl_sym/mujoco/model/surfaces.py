@@ -22,16 +22,18 @@ from torchrl_sym.mujoco.model.shapes import (
 )
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel
 
+_BISECTIONS = 12  # points end up within a thousandth of a shape's size under its surface
+
 
 def surface_points(model: MjModel, pose: MjData, geom: int) -> Array:
-    """Points of the world on a geom's surface: its corners, and points all around; ``(n, 3)``."""
+    """Points of the world on a geom's surface: its corners, and points all around just below it."""
     kind = int(model.geom_type[geom])
     vertices = hull_vertices(model, int(model.geom_dataid[geom])) if kind == MESH else None
     corners = furthest(kind, model.geom_size[geom][None], DIRECTIONS[None], vertices)[0]
 
     rays = DIRECTIONS * model.geom_aabb[geom, 3:]  # long shapes get points along their whole length
     low, high = np.zeros(len(rays)), np.full(len(rays), 4.0)
-    for _ in range(30):
+    for _ in range(_BISECTIONS):
         middle = (low + high) / 2
         inside = _excess(model, geom, middle[:, None] * rays) <= 0
         low, high = np.where(inside, middle, low), np.where(inside, high, middle)
