@@ -3,9 +3,21 @@
 `derive` finds where everything goes; it says nothing on whether the left leg weighs what the right one
 does. `audit` does: for each element g of a group, the mass, inertia, axes, ranges, gains, shapes, ... of
 every part are moved by g and compared with those of the part's image. What differs in unit is made
-relative: masses to the total mass, lengths to the model's extent, ranges to their width, everything else
-to the largest value in the model. A model is *exact* if nothing differs: its steps then commute with g to
-rounding. It also warns of settings that make the solver itself break the symmetry.
+relative, to what is much for a robot:
+
+====================================  ==============================================================
+masses, gravity compensation          the total mass of what moves
+lengths (centres of mass, anchors)    the size of the moving bodies, whatever room they stand in
+angles (axes, gravity)                a radian
+inertias                              the largest inertia of a link
+friction, damping, springs of joints  the joint's torque (:mod:`~torchrl_sym.mujoco.audit.scales`)
+ranges                                their width
+everything else                       the largest value among parts of its kind
+====================================  ==============================================================
+
+A model is *exact* if nothing of its dynamics and collision shapes differs: its steps then commute with g to
+rounding. Whatever changes a mirrored step is compared, which a test makes sure of: it changes every number
+of a rich model. The report also warns of settings that make the solver itself break the symmetry.
 """
 
 from __future__ import annotations
