@@ -2,12 +2,16 @@
 
 from types import SimpleNamespace
 
+import gymnasium
 import pytest
 import torch
+from torchrl.envs.libs.isaac_lab import IsaacLabWrapper
 
+from tests.managers import Manager, cfg
 from tests.point_groups import random
 from torchrl_sym import Exchanged, PointGroup
 from torchrl_sym.bridges import isaac_lab
+from torchrl_sym.bridges.terms import observation_manager
 from torchrl_sym.representations import (
     axial,
     image,
@@ -32,46 +36,8 @@ FRAME = {  # one frame of every term
 VECTORS = ["base_lin_vel", "base_ang_vel", "joint_pos"]
 
 
-def cfg(**settings):
-    defaults = {"history_length": 0, "flatten_history_dim": True, "clip": None, "scale": None}
-    return SimpleNamespace(**defaults | settings)
-
-
-class Manager:
-    """Has what both observation managers have, and computes as they do, from given frames."""
-
-    def __init__(self, groups, concatenate=True, dim=-1, frame=FRAME):
-        self.groups, self.frame = groups, frame
-        self.group_obs_concatenate = dict.fromkeys(groups, concatenate)
-        self._group_obs_concatenate_dim = dict.fromkeys(groups, dim + 1 if dim >= 0 else dim)
-        self.active_terms = {group: list(terms) for group, terms in groups.items()}
-        self._group_obs_term_cfgs = {group: list(terms.values()) for group, terms in groups.items()}
-        values = self.compute(
-            {name: random(9, 1, *rho.event_shape) for name, rho in frame.items()}, raw=True
-        )
-        self.group_obs_term_dim = {g: [x.shape[1:] for x in terms.values()] for g, terms in values.items()}
-
-    def compute(self, frames, raw=False):
-        """Observations ``[B]`` from frames of terms, ``(T, B, ...)``, the oldest first."""
-        out = {}
-        for group, terms in self.groups.items():
-            values = {}
-            for name, term in terms.items():
-                x = frames[name]
-                x = x.clip(*term.clip) if term.clip else x
-                x = x * torch.as_tensor(term.scale) if term.scale is not None else x
-                length = term.history_length
-                history = x[-length:].movedim(0, 1)  # (B, T, ...)
-                flat = history.reshape(x.shape[1], -1) if term.flatten_history_dim else history
-                values[name] = flat if length else x[-1]
-            if self.group_obs_concatenate[group] and not raw:
-                values = torch.cat(list(values.values()), self._group_obs_concatenate_dim[group])
-            out[group] = values
-        return out
-
-
 def env(*args, **kwargs):
-    return SimpleNamespace(observation_manager=Manager(*args, **kwargs))
+    return SimpleNamespace(observation_manager=Manager(*args, **{"frame": FRAME} | kwargs))
 
 
 def assert_mirrored(environment, symmetry, frame=FRAME):
@@ -89,7 +55,7 @@ def assert_mirrored(environment, symmetry, frame=FRAME):
 
 
 def declared(environment, **more):
-    used = {name for terms in environment.observation_manager.groups.values() for name in terms}
+    used = {name for terms in observation_manager(environment).groups.values() for name in terms}
     return isaac_lab.symmetry(environment, {name: FRAME[name] for name in used}, JOINTS, **more)
 
 
@@ -239,3 +205,44 @@ def test_terms_of_two_groups_are_refused():
     terms = {"joint_pos": JOINTS, "base_lin_vel": polar(PointGroup.reflection("x"))}
     with pytest.raises(ValueError, match="one group"):
         isaac_lab.symmetry(environment, terms, JOINTS)
+
+
+class ManagerBasedEnv(gymnasium.Env):
+    """What gymnasium, and so TorchRL's wrapper, sees of Isaac Lab's environment."""
+
+    num_envs, device = 4, "cpu"
+
+    def __init__(self, manager):
+        self.observation_manager = manager
+        self.single_observation_space = self._space(self._observations())
+        self.single_action_space = self._space(torch.zeros(1, 3))
+        batch = gymnasium.vector.utils.batch_space
+        self.observation_space = batch(self.single_observation_space, self.num_envs)
+        self.action_space = batch(self.single_action_space, self.num_envs)
+
+    def _space(self, value):
+        if isinstance(value, dict):
+            return gymnasium.spaces.Dict({name: self._space(each) for name, each in value.items()})
+        return gymnasium.spaces.Box(-float("inf"), float("inf"), value.shape[1:])
+
+    def _observations(self):
+        frames = {name: torch.randn(9, 4, *rho.event_shape) for name, rho in FRAME.items()}
+        return self.observation_manager.compute(frames)
+
+    def reset(self, seed=None, options=None):
+        return self._observations(), {}
+
+    def step(self, action):
+        no = torch.zeros(self.num_envs, dtype=torch.bool)
+        return self._observations(), torch.zeros(self.num_envs), no, no, {}
+
+
+def test_torchrls_wrapper_gives_the_same_keys():
+    groups = {"policy": {name: cfg(history_length=2) for name in VECTORS}, "critic": {"camera": cfg()}}
+    manager = Manager(groups, FRAME)
+    manager.group_obs_concatenate["critic"] = False
+    wrapped = IsaacLabWrapper(ManagerBasedEnv(manager), device="cpu")
+    symmetry = declared(wrapped)
+    assert symmetry.keys() == ["policy", ("critic", "camera"), "action"]
+    symmetry.check_specs(wrapped)
+    assert symmetry.orbit(wrapped.rollout(3)).batch_size == (2, 4, 3)

@@ -13,6 +13,7 @@ from PIL import Image
 import results_page
 from comparison import study
 from comparison.robot_tables import tables
+from torchrl_sym import Symmetry
 from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -54,6 +55,20 @@ def test_memory():
     output = run("examples/memory.py", *tiny)
     assert re.search(r"recurrent, seed 0: return -\d.*of mirror images", output)
     assert re.search(r"with memory -\d[\d.]*, without -\d", output)
+
+
+def test_rsl_rl_trains_with_a_symmetry_from_a_file():
+    pytest.importorskip("rsl_rl", reason="pip install rsl-rl-lib")
+    output = run("examples/rsl_rl_ppo.py", "--iterations", "2", "--num-envs", "8")
+    assert '"reflect-x": "-0..2"' in output
+    assert re.search(r"after 2 iterations: mirror error [\d.]+ of the mean action", output)
+
+
+def test_mjlab_trains_with_the_symmetry_of_its_robot(tmp_path):
+    pytest.importorskip("mjlab", reason="pip install mjlab")
+    tiny = ["--iterations", "1", "--num-envs", "4", "--device", "cpu", "--out", tmp_path / "g1.json"]
+    assert re.search(r"mirror error [\d.]+ of the mean action", run("examples/mjlab_ppo.py", *tiny))
+    assert Symmetry.load(tmp_path / "g1.json")["action"].dim == 29
 
 
 @pytest.mark.parametrize("script", ["examples/sac.py", "examples/td3.py"])

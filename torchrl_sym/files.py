@@ -26,7 +26,7 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_sym import checks
-from torchrl_sym.entries import Exchanged, path
+from torchrl_sym.entries import Exchanged
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.representations import Representation
 from torchrl_sym.representations.blocks import Block, Mixing, SignedPermutation
@@ -56,7 +56,7 @@ def write(
     elements = dict(zip(group.names, matrices, strict=True))
     entries = [
         {
-            "keys": [list(path(name)) for name in names],
+            "keys": [name if isinstance(name, str) else list(name) for name in names],
             "event_shape": list(representation.event_shape),
             "blocks": [_written(block, group) for block in representation.blocks],
         }
@@ -131,7 +131,7 @@ def _read(content: dict[str, Any]) -> tuple[PointGroup, dict[NestedKey | Exchang
     representations: dict[NestedKey | Exchanged, Representation] = {}
     for number, entry in enumerate(checks.sequence("entries", entries, "entries")):
         keys, shape, blocks = checks.entries(f"entries[{number}]", entry, "keys", "event_shape", "blocks")
-        names = [checks.key("keys", tuple(_list("a key", key))) for key in _list("keys", keys)]
+        names = [_key(key) for key in _list("keys", keys)]
         key = Exchanged(*names) if len(names) != 1 else names[0]
         if key in representations:
             raise ValueError(f"expected distinct keys, got {key!r} twice")
@@ -140,6 +140,10 @@ def _read(content: dict[str, Any]) -> tuple[PointGroup, dict[NestedKey | Exchang
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"entry {key!r}: {error.args[0]}") from error
     return group, representations, checks.flag("strict", strict)
+
+
+def _key(written: Any) -> NestedKey:
+    return checks.key("keys", tuple(written) if isinstance(written, list) else written)
 
 
 def _list(name: str, value: Any) -> list[Any]:

@@ -18,7 +18,7 @@ from typing import Any
 from tensordict import NestedKey
 
 from torchrl_sym import checks
-from torchrl_sym.bridges.terms import declare, given_terms, observation_manager, terms_of
+from torchrl_sym.bridges.terms import assemble, given_terms, observation_manager, terms_of
 from torchrl_sym.entries import Exchanged
 from torchrl_sym.representations import Representation
 from torchrl_sym.symmetry import Symmetry
@@ -67,5 +67,4 @@ def symmetry(
             "invariant(group, d) if no element changes them"
         )
     checks.instance("action", action, Representation)
-    declared = declare(manager, {term: representations[term] for term in found})
-    return Symmetry(action.group, {**declared, "action": action, **(others or {})})
+    return assemble(manager, {term: representations[term] for term in found}, action, others)

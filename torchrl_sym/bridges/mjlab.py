@@ -20,8 +20,8 @@ from torchrl_sym import checks
 from torchrl_sym.bridges.frames import frame_maps, places, rays, refuse_turned_yaw
 from torchrl_sym.bridges.terms import (
     Term,
+    assemble,
     check_processing,
-    declare,
     given_terms,
     observation_manager,
     terms_of,
@@ -70,7 +70,11 @@ def symmetry(
     """
     check_group(group)
     manager = observation_manager(env)
-    base = env if hasattr(env, "sim") else env.unwrapped
+    base = env if hasattr(env, "sim") else getattr(env, "unwrapped", env)
+    if not hasattr(getattr(base, "sim", None), "mj_model"):
+        raise TypeError(
+            f"env: expected an environment of mjlab, with a compiled model, got {checks.shown(env)}"
+        )
     found = terms_of(manager)
     given = given_terms(found, terms or {})
     reader = _Reader(base, derive(base.sim.mj_model, group, keyframe))
@@ -91,7 +95,7 @@ def symmetry(
             "give their representations by name, terms={'height': scalar(group), ...}, drop them from the "
             "observation, or use a smaller group"
         )
-    return Symmetry(group, {**declare(manager, representations), "action": acts, **(others or {})})
+    return assemble(manager, representations, acts, others)
 
 
 class _Reader:

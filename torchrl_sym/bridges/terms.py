@@ -21,8 +21,10 @@ from tensordict import NestedKey
 from torch import Tensor
 
 from torchrl_sym import checks
+from torchrl_sym.entries import Exchanged
 from torchrl_sym.representations import Representation, invariant, items
 from torchrl_sym.representations.blocks import block_from_terms, join
+from torchrl_sym.symmetry import Symmetry
 
 _MAGNITUDES = (1e-2, 1.0, 1e2, 1e4)  # of the values that clips and scales are tried on
 _TOLERANCE = 1e-5  # relative; managers keep scales in single precision
@@ -114,15 +116,24 @@ def given_terms(terms: list[Term], given: Mapping[Any, Representation]) -> dict[
     return found
 
 
-def declare(
-    manager: Any, representations: Mapping[Term, Representation]
-) -> dict[NestedKey, Representation]:
-    """Representations of what a manager writes, by key, from those of all of its terms.
+def assemble(
+    manager: Any,
+    representations: Mapping[Term, Representation],
+    action: Representation,
+    others: Mapping[NestedKey | Exchanged, Representation] | None,
+) -> Symmetry:
+    """The symmetry of what a manager writes, from the representations of all of its terms.
+
+    Args:
+        manager: the observation manager.
+        representations: how one frame of every term transforms, in the manager's order.
+        action: how the action transforms.
+        others: entries that the manager does not write.
 
     Raises:
         ValueError: a term has another size, or is clipped or scaled such that it does not transform.
     """
-    declared: dict[NestedKey, Representation] = {}
+    declared: dict[NestedKey | Exchanged, Representation] = {}
     for group, terms in itertools.groupby(representations, key=lambda term: term.group):
         parts = {term.name: _with_history(term, representations[term]) for term in terms}
         if not manager.group_obs_concatenate[group]:
@@ -130,7 +141,15 @@ def declare(
             continue
         dim = getattr(manager, "_group_obs_concatenate_dim", {}).get(group, -1)
         declared[group] = _concatenated(list(parts.values()), dim - 1 if dim > 0 else dim)
-    return declared
+    declared["action"] = action
+
+    more = dict(checks.mapping("others", {} if others is None else others, "keys to representations"))
+    twice = [key for key in more if key in declared]
+    if twice:
+        raise ValueError(
+            f"others: expected entries that the manager does not write, got {twice}; name their terms"
+        )
+    return Symmetry(action.group, declared | more)
 
 
 def _with_history(term: Term, representation: Representation) -> Representation:
