@@ -7,13 +7,17 @@ its own.
 import copy
 import dataclasses
 import os
+import re
+import subprocess
+import sys
+from pathlib import Path
 
 import mujoco
 import pytest
 import torch
 from torchrl.envs import MJLabWrapper
 
-from torchrl_sym import PointGroup
+from torchrl_sym import PointGroup, Symmetry
 from torchrl_sym.bridges import mjlab
 from torchrl_sym.bridges.rsl_rl import data_augmentation
 from torchrl_sym.mujoco import SymmetryError, derive
@@ -31,6 +35,7 @@ envs, observation, entities, rl, registry = (
     )
 )
 
+ROOT = Path(__file__).parents[1]
 MIRROR = PointGroup.reflection("y")
 BOXES = [(0.75, 0.3, 0.1), (-0.6, 0.6, 0.3), (0.1, 0.9, 0.2)]  # x, y and height of some, in metres
 CLOSE = 1e-2  # single precision, five steps with contacts, of velocities up to 10 rad/s
@@ -265,3 +270,13 @@ def test_a_sensor_beside_the_plane_is_named():
         expected = {"base_lin_vel": wrong > 0, "height_scan": wrong < 0.02}  # rays may hit an edge
         assert expected.get(name, wrong == 0), name
     env.close()
+
+
+def test_the_example_trains_and_keeps_the_symmetry(tmp_path):
+    tiny = ["--iterations", "1", "--num-envs", "4", "--device", "cpu", "--out", str(tmp_path / "g1.json")]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(ROOT / "examples/mjlab_ppo.py"), *tiny]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert re.search(r"after 1 iterations: mirror error [\d.]+ of the mean action", result.stdout)
+    assert Symmetry.load(tmp_path / "g1.json")["action"].dim == 29
