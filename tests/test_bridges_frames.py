@@ -89,10 +89,11 @@ def test_a_grid_of_rays_is_a_height_map():
     assert torch.equal(scan.matrices, points(K4, grid).matrices)
 
 
+@pytest.mark.parametrize("group", [K4, C4], ids=["K4", "C4"])
 @pytest.mark.parametrize("feet", [("0 0 0",) * 4, ("0 0 90", "0 0 0", "0 0 -90", "0 0 180")])
-def test_rays_of_several_feet_go_where_their_points_go(feet):
+def test_rays_of_several_feet_go_where_their_points_go(group, feet):
     """Compared with the places of the rays in the world, whatever the frames of the feet."""
-    quadruped, names = robot(K4, feet=feet), [f"foot{i}" for i in range(4)]
+    quadruped, names = robot(group, feet=feet), [f"foot{i}" for i in range(4)]
     ring = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [-0.1, 0.0, 0.0], [0.0, -0.1, 0.0]])
     frames = places(quadruped, names, tables(quadruped, "site"))
     scan = rays(frames, frame_maps(quadruped, "site", names), ring, DOWN.expand(4, 3))
@@ -104,7 +105,7 @@ def test_rays_of_several_feet_go_where_their_points_go(feet):
         + ring.double() @ torch.as_tensor(data.site(name).xmat).view(3, 3).T
         for name in names
     ]
-    assert torch.equal(scan.matrices, points(K4, torch.cat(world)[:, :2]).matrices)
+    assert torch.equal(scan.matrices, points(group, torch.cat(world)[:, :2]).matrices)
 
 
 def test_rays_that_are_not_carried_to_rays_are_refused():
