@@ -13,12 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import mujoco
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchrl_sym.mujoco import ModelSymmetry
+from torchrl_sym.mujoco.model.types import Array, MjModel, mj
 from torchrl_sym.representations import Representation, permutation
 from torchrl_sym.representations.blocks import SignedPermutation
 
@@ -82,12 +82,10 @@ def refuse_turned_yaw(robot: ModelSymmetry, kind: str, names: Sequence[str]) -> 
         )
 
 
-def _rotations(
-    model: mujoco.MjModel, kind: str, names: Sequence[str], qpos: np.ndarray, align: str
-) -> np.ndarray:
-    data = mujoco.MjData(model)
+def _rotations(model: MjModel, kind: str, names: Sequence[str], qpos: Array, align: str) -> Array:
+    data = mj.MjData(model)
     data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
+    mj.mj_kinematics(model, data)
     found = np.stack([getattr(data, kind)(name).xmat.reshape(3, 3) for name in names])
     if align == "base":
         return found
