@@ -26,11 +26,12 @@ LAYERS = (
     "groups",
     "representations",
     "entries normalization",
-    "declaration",
+    "declaration files",
     "environments",
     "symmetry",
     "orbits memory networks outputs",
     "augment transforms replay mirror_loss symmetric_ppo modules vecnorm mujoco testing",
+    "bridges",
     "recipes",
     "__init__",
 )
