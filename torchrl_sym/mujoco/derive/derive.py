@@ -16,6 +16,7 @@ import torch
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup, check_group
 from torchrl_sym.mujoco.derive.action import Action
+from torchrl_sym.mujoco.derive.chains import mixing_axes
 from torchrl_sym.mujoco.derive.coordinates import map_coordinates
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.derive.search import Search
@@ -88,12 +89,11 @@ def derive(
     objects = carried_bodies(model, carried)
     lifts = _lifts(model, group, objects)
     found = Search(model, group, lifts, tolerance, objects, _checked(axis)).find(keyframe)
-    actions = []
-    for matcher in found.matchers:
-        map_ = map_coordinates(
-            model, matcher.data, matcher.links, matcher, matcher.images, matcher.joints()
-        )
-        actions.append(Action(model, matcher, map_, tolerance))
+    matchers = found.matchers
+    slides = mixing_axes(
+        matchers[0].pairing.parts, [(m.matrix, m.images, m.joint_pairs()) for m in matchers]
+    )
+    actions = [Action(m, map_coordinates(m, slides), tolerance) for m in matchers]
     try:
         return ModelSymmetry(model, group, actions, pose=found.words, ambiguous=found.ambiguous)
     except ValueError as error:

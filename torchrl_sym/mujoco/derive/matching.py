@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_sym.mujoco.derive.chains import JointPairs
 from torchrl_sym.mujoco.derive.pairing import Misfit, Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.model.poses import shift
@@ -82,5 +83,8 @@ class Matcher:
 
     def joints(self) -> dict[int, int]:
         """Image of every joint, if every link has one."""
-        pairs = (self.pairing.joints_to(a, b) for a, b in self.images.items())
-        return {i: j for joints in pairs for i, j in joints.items()}
+        return {i: j for joints in self.joint_pairs().values() for i, j in joints.images.items()}
+
+    def joint_pairs(self) -> dict[int, JointPairs]:
+        """Images of the joints of every link."""
+        return {a: self.pairing.joint_pairs(a, b) for a, b in self.images.items()}

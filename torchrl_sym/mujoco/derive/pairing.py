@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from torchrl_sym.mujoco.derive.chains import JointPairs, pair_joints
 from torchrl_sym.mujoco.derive.names import counterparts, exchanged
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.model.links import is_loose
@@ -68,6 +69,7 @@ class Pairing:
         self._costs: dict[tuple[int, int], float] = {}
         self._known: dict[str, dict[str, int]] = {}
         self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}
+        self._joints: dict[tuple[int, int], JointPairs] = {}
 
     def images(
         self, a: int, b: int, known: dict[int, int] | None = None, only: Sequence[int] | None = None
@@ -104,14 +106,22 @@ class Pairing:
 
     def joints_to(self, a: int, b: int) -> dict[int, int]:
         """Image among the joints of link b of every joint of link a; empty if their numbers differ."""
-        mine, theirs = self.links[a].joints, self.links[b].joints
-        if len(mine) != len(theirs) or not mine:
-            return {}
-        if len(mine) == 1:
-            return {mine[0]: theirs[0]}
-        cost = np.array([[self.joint_cost(i, j) for j in theirs] for i in mine])
-        rows, columns = linear_sum_assignment(cost)
-        return {mine[r]: theirs[c] for r, c in zip(rows, columns, strict=True)}
+        return self.joint_pairs(a, b).images
+
+    def joint_pairs(self, a: int, b: int) -> JointPairs:
+        """Images among the joints of link b of those of link a, whether they mix and in which order."""
+        if (a, b) not in self._joints:
+            mine, theirs = self.links[a].joints, self.links[b].joints
+            if len(mine) != len(theirs) or not mine:
+                self._joints[a, b] = JointPairs({}, {})
+            elif len(mine) == 1:
+                self._joints[a, b] = JointPairs(
+                    {mine[0]: theirs[0]}, {mine[0]: self.joint_cost(mine[0], theirs[0])}
+                )
+            else:
+                cost = np.array([[self.joint_cost(i, j) for j in theirs] for i in mine])
+                self._joints[a, b] = pair_joints(self.parts, self.matrix, mine, theirs, cost)
+        return self._joints[a, b]
 
     def joint_cost(self, i: int, j: int) -> float:
         """How far joint i's image is from joint j: type, axis up to sign, and anchor."""
@@ -160,7 +170,7 @@ class Pairing:
             if a == 0 or a in self.parts.carried:
                 continue
             link = self.links[a]
-            joints = self.joints_to(a, b)
+            joints = self.joint_pairs(a, b)
             short = len(link.joints) != len(self.links[b].joints) or any(
                 c not in images for c in link.children
             )
@@ -169,8 +179,10 @@ class Pairing:
             gap = self.center_gap(a, b) / self.parts.size(b) / _CENTER
             if gap > found.size * tolerance:
                 found = Misfit(gap / max(tolerance, 1e-12), "link", a, b)
-            for i, j in joints.items():
-                cost = self.joint_cost(i, j)
+            if joints.order > found.size * tolerance:
+                found = Misfit(joints.order / max(tolerance, 1e-12), "order", a, b)
+            for i, j in joints.images.items():
+                cost = joints.costs[i]
                 if cost > found.size * tolerance:
                     found = Misfit(cost / max(tolerance, 1e-12), "joint", i, j)
         return found
@@ -217,11 +229,11 @@ class Pairing:
         cost += float(np.abs(image - other.inertia).max()) / self.total_inertia
         cost += _STAY * (a != b)
         cost += _MISFIT * (self._is_mocap(a) != self._is_mocap(b))
-        joints = self.joints_to(a, b)
+        joints = self.joint_pairs(a, b)
         cost += _MISFIT * (len(one.joints) != len(other.joints))
-        cost += sum(self.joint_cost(i, j) for i, j in joints.items())
+        cost += sum(joints.costs.values()) + joints.order
         if self._names is not None:
-            cost += self._hint(a, b, joints)
+            cost += self._hint(a, b, joints.images)
         below, pairs = self.assign(one.children, other.children)
         return cost + below, pairs
 
@@ -319,6 +331,8 @@ class Pairing:
                 + f"; if it may have any shape, pass carried=[{name!r}]"
                 * self._can_be_carried(a)
             )
+        if misfit.kind == "order":
+            return self._explain_order(a, b, element)
         turn, away = self.joint_gaps(a, b)
         if not np.isfinite(turn):
             what = label_of(model, "joint", a)
@@ -327,6 +341,18 @@ class Pairing:
             f"{label_of(model, 'joint', a)} has no image under {element!r}: the nearest, "
             f"{label_of(model, 'joint', b)}, misses it by {np.degrees(turn):.2g} degrees and "
             f"{1e3 * away:.2g} mm ({limit})"
+        )
+
+    def _explain_order(self, a: int, b: int, element: str) -> str:
+        def listed(joints: Sequence[int]) -> str:
+            return ", ".join(label_of(self.model, "joint", j) for j in joints)
+
+        images = self.joints_to(a, b)
+        return (
+            f"{label_of(self.model, 'body', a)} has no image under {element!r}: its joints, "
+            f"{listed(self.links[a].joints)}, go to {listed(list(images.values()))} in this order, but "
+            f"{label_of(self.model, 'body', b)} has them in the order {listed(self.links[b].joints)}, and they "
+            "do not commute; list the joints of both bodies in the same order, or use a ball joint"
         )
 
     def _can_be_carried(self, body: int) -> bool:
