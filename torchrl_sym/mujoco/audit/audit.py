@@ -31,7 +31,12 @@ from torchrl_sym.mujoco.audit.bodies import compare_fluid, compare_gravity, comp
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.equalities import compare_equalities
 from torchrl_sym.mujoco.audit.filters import compare_contacts
-from torchrl_sym.mujoco.audit.joints import compare_constraint_weights, compare_dofs, compare_joints
+from torchrl_sym.mujoco.audit.joints import (
+    compare_constraint_weights,
+    compare_dofs,
+    compare_joints,
+    compare_order,
+)
 from torchrl_sym.mujoco.audit.report import AuditReport, Residual
 from torchrl_sym.mujoco.audit.scales import efforts_of
 from torchrl_sym.mujoco.audit.shapes import compare_shapes
@@ -111,6 +116,7 @@ def audit_derived(symmetry: ModelSymmetry, tolerance: float) -> AuditReport:
     efforts = efforts_of(model, matcher.data, matcher.extent)
 
     rows: list[Residual] = []
+    untold: tuple[str, ...] = ()
     loose: dict[str, None] = {}
     for g in range(1, group.order):
         run = Comparison(symmetry, g, efforts)
@@ -118,11 +124,14 @@ def audit_derived(symmetry: ModelSymmetry, tolerance: float) -> AuditReport:
         rows += run.worst.values()
         unchecked += tuple(text for text in run.unchecked if text not in unchecked)
         warnings += tuple(text for text in run.warnings if text not in warnings)
+        untold += tuple(text for text in run.untold if text not in untold)
     if loose:
         shown = ", ".join(list(loose)[:4]) + ", ..." * (len(loose) > 4)
         text = f"{len(loose)} sites are out of place ({shown}); nothing in the model uses them, so do not"
         warnings += (f"{text} observe them",)
-    return AuditReport(elements, tuple(rows), tolerance, warnings=warnings, unchecked=unchecked)
+    return AuditReport(
+        elements, tuple(rows), tolerance, warnings=warnings, unchecked=unchecked, untold=untold
+    )
 
 
 def can_move(model: MjModel) -> bool:
@@ -135,6 +144,7 @@ def _compare(c: Comparison) -> list[str]:
     compare_gravity(c)
     compare_links(c)
     compare_joints(c)
+    compare_order(c)
     compare_dofs(c)
     compare_actuators(c)
     compare_tendons(c)

@@ -25,6 +25,7 @@ class Comparison:
         self.element, self.efforts = symmetry.group.names[g], efforts
         self.worst: dict[str, Residual] = {}
         self.unchecked: list[str] = []
+        self.untold: list[str] = []
         self.warnings: list[str] = []
 
     def add(self, term: str, residual: float, name: str, kind: Kind = "dynamics", amount: str = "") -> None:

@@ -19,7 +19,10 @@ def compare_joints(c: Comparison) -> None:
         name, kind = c.name("joint", i, j), int(model.jnt_type[i])
         sign, shift = c.map.signs.get(i, 1.0), c.map.offsets.get(i, 0.0)
         gap = turn @ data.xanchor[i] - data.xanchor[j]
-        if kind in (HINGE, SLIDE):
+        if i in c.map.mixed:
+            _compare_mixing(c, i, name)
+            gap = np.zeros(3)
+        elif kind in (HINGE, SLIDE):
             axis = data.xaxis[j]
             angle = float(np.linalg.norm(np.cross(turn @ data.xaxis[i], axis)))
             length = abs(float(np.linalg.norm(model.jnt_axis[i]) - np.linalg.norm(model.jnt_axis[j])))
@@ -28,8 +31,9 @@ def compare_joints(c: Comparison) -> None:
         if kind != FREE:
             apart = float(np.linalg.norm(gap))
             c.add("joint anchor", apart / c.matcher.extent, name, amount=f"{1e3 * apart:.2g} mm")
-        c.range("joint range", "jnt_range", "jnt_limited", i, j, sign, shift, name)
-        c.range("joint force range", "jnt_actfrcrange", "jnt_actfrclimited", i, j, sign, 0.0, name)
+        if i not in c.map.mixed:
+            c.range("joint range", "jnt_range", "jnt_limited", i, j, sign, shift, name)
+            c.range("joint force range", "jnt_actfrcrange", "jnt_actfrclimited", i, j, sign, 0.0, name)
         same = np.flatnonzero(model.jnt_type == kind)
         spring = c.efforts.scale("stiffness", model.jnt_stiffness[model.dof_jntid])[model.jnt_dofadr[j]]
         stiffness = model.jnt_stiffness[[i, j]] / spring
@@ -45,6 +49,21 @@ def compare_joints(c: Comparison) -> None:
                 one = np.concatenate([one[:-4], one[-4:] * np.sign(one[-4:] @ other[-4:] or 1.0)])
             scale = c.matcher.extent if kind == SLIDE else 1.0
             c.add("springref", float(np.abs(one - other).max()) / scale, name)
+
+
+def _compare_mixing(c: Comparison, i: int, name: str) -> None:
+    """A slide whose coordinate enters those of several: what its axis becomes, and whether a box limits it."""
+    axes = sum(weight * c.data.xaxis[k] for k, weight in c.map.mixed[i].items())
+    c.add("joint axis", float(np.linalg.norm(c.matcher.matrix @ c.data.xaxis[i] - axes)), name)
+    for term, limited in (("joint range", "jnt_limited"), ("joint force range", "jnt_actfrclimited")):
+        if getattr(c.model, limited)[i]:
+            c.add(term, 1.0, f"{name} (a box, which the element turns)")
+
+
+def compare_order(c: Comparison) -> None:
+    """Whether the joints of one body act one after the other as those of its image do."""
+    for body, gap in c.map.order.items():
+        c.add("joint order", gap, c.name("body", body, c.map.bodies[body]))
 
 
 def compare_dofs(c: Comparison) -> None:

@@ -60,6 +60,7 @@ class AuditReport:
         outcome: ``"exact"``, ``"approximate"``, ``"no"``, ``"cannot tell"`` or ``"nothing"`` (to compare).
         warnings: settings and contacts with which even an exact model is not simulated symmetrically.
         unchecked: what was not compared.
+        untold: parts, such as actuators, of which it cannot be told where they go.
     """
 
     elements: tuple[str, ...]
@@ -69,19 +70,23 @@ class AuditReport:
     refused_as: Outcome = "no"
     warnings: tuple[str, ...] = ()
     unchecked: tuple[str, ...] = ()
+    untold: tuple[str, ...] = ()
 
     @property
     def outcome(self) -> Outcome:
         if self.refusal is not None:
             return self.refused_as
-        return self._outcome_of(self.of(*HEADLINE))
+        outcome = self._outcome_of(self.of(*HEADLINE))
+        return "cannot tell" if self.untold and outcome != "no" else outcome
 
     @property
     def reason(self) -> str | None:
         """Why the model lacks the symmetry, or one cannot tell; None if it has it, at least nearly."""
         if self.outcome in ("exact", "approximate"):
             return None
-        return self.refusal if self.refusal is not None else str(self.worst)
+        if self.refusal is not None:
+            return self.refusal
+        return self.untold[0] if self.outcome == "cannot tell" else str(self.worst)
 
     @property
     def exact(self) -> bool:
@@ -106,7 +111,9 @@ class AuditReport:
             words = {"no": "not a symmetry", "nothing": "nothing to compare"}
             return f"{words.get(self.outcome, self.outcome)} ({self.refusal})"
         text = self._phrase(self.of(*HEADLINE))
-        if text == "exact" and self.unchecked:
+        if self.outcome == "cannot tell":
+            text = f"cannot tell ({'; '.join(self.untold)}; the rest: {text})"
+        elif text == "exact" and self.unchecked:
             text = "exact in what was checked"
         apart = {kind: self._phrase(self.of(kind)) for kind in APART}
         return "; ".join([text, *(f"{kind}: {said}" for kind, said in apart.items() if said != "exact")])
