@@ -137,9 +137,10 @@ def test_one_change_is_found_at_its_term_and_nowhere_else(kind, change, term, na
     report = audit(robot(kind, change), GROUPS[kind])
     terms, names = broken(report)
     assert not report.exact
-    assert terms == {term}, str(report)
+    also = {"tendon path"} if "site" in change else set()  # a tendon runs through that site
+    assert terms == {term} | also, str(report)
     assert name in names
-    assert report.worst.term == term and term in report.verdict
+    assert report.worst.term in terms and report.worst.term in report.verdict
     assert name in str(report)
 
 

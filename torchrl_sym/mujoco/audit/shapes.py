@@ -101,15 +101,6 @@ def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
     )
 
 
-def shape_residual(c: Comparison, a: int, b: int) -> float:
-    """Largest distance between the image of geom a and geom b, relative; infinite if their kinds differ."""
-    if c.model.geom_type[a] != c.model.geom_type[b]:
-        return np.inf
-    extent = c.matcher.extent
-    one = _features(c.model, c.data, np.array([a]), c.matcher.matrix, extent)
-    return float(np.abs(one - _features(c.model, c.image, np.array([b]), np.eye(3), extent)).max())
-
-
 def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, extent: float) -> Array:
     """Support functions of the images of geoms, relative to a scale; of planes, normal and height."""
     out = geom_supports(model, pose, geoms, DIRECTIONS @ turn) / extent

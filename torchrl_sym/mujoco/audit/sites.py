@@ -67,39 +67,6 @@ def compare_sites(c: Comparison) -> list[str]:
     return loose
 
 
-def side_residual(c: Comparison, k: int, m: int) -> float:
-    """How far the side on which wrap k passes is from that of wrap m: 0 if they are images, 1 opposite.
-
-    Wraps are rows of ``model.wrap_objid`` on spheres and cylinders; without a side site, a tendon takes the
-    shorter way.
-    """
-    model, turn = c.model, c.matcher.matrix
-    a, b = (int(site) for site in model.wrap_prm[[k, m]])
-    if a < 0 or b < 0:
-        return float(a >= 0 or b >= 0)
-    (one, inside), (other, inside_image) = _side(c.model, c.data, k, a), _side(c.model, c.image, m, b)
-    owner = model.body_weldid[model.site_bodyid]
-    if inside != inside_image or c.map.bodies[int(owner[a])] != owner[b]:
-        return 1.0
-    gap = 0.0 if inside else float(np.linalg.norm(turn @ one - other)) / 2
-    if owner[a] != model.body_weldid[model.geom_bodyid[model.wrap_objid[k]]]:
-        # seen from another link, the side changes as that moves
-        place = np.linalg.norm(turn @ c.data.site_xpos[a] - c.image.site_xpos[b])
-        gap = max(gap, float(place) / c.matcher.extent)
-    return gap
-
-
-def _side(model: MjModel, pose: MjData, wrap: int, site: int) -> tuple[Array, bool]:
-    """Direction from a wrapping geom to a side site, and whether that lies inside the geom."""
-    geom = int(model.wrap_objid[wrap])
-    offset = pose.site_xpos[site] - pose.geom_xpos[geom]
-    inside = float(np.linalg.norm(offset)) < model.geom_size[geom, 0]
-    if int(model.wrap_type[wrap]) == int(_WRAP.mjWRAP_CYLINDER):  # its height does not matter
-        axis = pose.geom_xmat[geom].reshape(3, 3)[:, 2]
-        offset = offset - (offset @ axis) * axis
-    return offset / max(float(np.linalg.norm(offset)), 1e-12), inside
-
-
 def _support(model: MjModel, pose: MjData, site: int, directions: Array) -> Array:
     frame = pose.site_xmat[site].reshape(1, 3, 3)
     return supports(
