@@ -153,7 +153,9 @@ class Pairing:
         return turn, float(np.sqrt(offset @ offset))
 
     def holds(self, a: int, b: int, tolerance: float) -> bool:
-        """Whether joints on link a have images among those on b, which no pose of theirs decides."""
+        """Whether b is where a should be, and joints on a have images on b: no pose decides that."""
+        if self.center_gap(a, b) > _CENTER * tolerance * self.parts.size(b):
+            return False
         mine, theirs = ([j for c in self.links[x].children for j in self.links[c].joints] for x in (a, b))
         return all(any(self.joint_cost(i, j) <= tolerance for j in theirs) for i in mine)
 

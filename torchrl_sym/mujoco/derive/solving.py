@@ -99,7 +99,22 @@ class _Solver:
         cost = sum(pairing.joint_cost(i, j) for i, j in pairing.joints_to(a, b).items())
         cost += abs(one.mass - other.mass) / pairing.total_mass
         moments = np.linalg.eigvalsh(one.inertia) - np.linalg.eigvalsh(other.inertia)
-        return cost + float(np.abs(moments).max()) / pairing.total_inertia + 1e-9 * (a != b)
+        cost += float(np.abs(moments).max()) / pairing.total_inertia + 1e-9 * (a != b)
+        return cost + sum(self._off_path(pairing, a, b, j) for j in other.joints[:1])
+
+    def _off_path(self, pairing: Pairing, a: int, b: int, joint: int) -> float:
+        """How far link a's centre of mass stays from that of b, however its first joint moves it."""
+        parts, axis = pairing.parts, pairing.parts.axes[joint]
+        ends = pairing.matrix @ parts.centers[a], parts.centers[b]
+        if int(self.model.jnt_type[joint]) == SLIDE:
+            gap = ends[0] - ends[1]
+            return float(np.linalg.norm(gap - (gap @ axis) * axis)) / parts.size(b)
+        if int(self.model.jnt_type[joint]) != HINGE:
+            return 0.0
+        arms = [end - parts.anchors[joint] for end in ends]
+        along = [float(arm @ axis) for arm in arms]
+        radii = [float(np.linalg.norm(arm - h * axis)) for arm, h in zip(arms, along, strict=True)]
+        return float(np.hypot(along[0] - along[1], radii[0] - radii[1])) / parts.size(b)
 
     def _settle(self, a: int) -> None:
         """Move the joints of the images of a link to where they belong, or its own where it is one."""
