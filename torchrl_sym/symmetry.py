@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_sym import checks, files
+from torchrl_sym import checks, files, printing
 from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, enclosing, split, without_next
@@ -366,6 +366,23 @@ class Symmetry(nn.Module):
         """
         group, representations, strict = files.read(path)
         return Symmetry(group, representations, strict=strict)
+
+    def code(self) -> str:
+        """The declaration of this symmetry as a person would write it: Python, to be pasted and reviewed.
+
+        ``print(symmetry)`` lists every entry instead.
+
+        Example:
+            >>> from torchrl_sym.representations import axial, polar
+            >>> group = PointGroup.reflection("y")
+            >>> text = Symmetry(group, {"velocity": polar(group) + axial(group)}).code()
+            >>> [line.strip() for line in text.splitlines() if "#" in line]
+            ['polar(group)  # 0-2', '+ axial(group)  # 3-5']
+        """
+        return printing.code(self.group, self._declaration.parts, self.strict)
+
+    def __str__(self) -> str:
+        return printing.table(self.group, self._declaration.parts)
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self.keys()}"

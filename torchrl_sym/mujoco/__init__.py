@@ -1,13 +1,15 @@
-"""Symmetry of MuJoCo models: find it, derive it, audit it, symmetrize it, verify it."""
+"""Symmetry of MuJoCo models: find, derive, audit, symmetrize and verify it, infer that of observations."""
 
 from torchrl_sym.mujoco.audit import AuditReport, audit
 from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
+from torchrl_sym.mujoco.infer import InferenceError, infer
 from torchrl_sym.mujoco.symmetries import SymmetriesReport, symmetries
 from torchrl_sym.mujoco.symmetrize import SymmetrizeReport, symmetrize, symmetrize_with_report
 from torchrl_sym.mujoco.verify import Remembered, VerifyReport, verify
 
 __all__ = [
     "AuditReport",
+    "InferenceError",
     "ModelSymmetry",
     "Remembered",
     "SymmetriesReport",
@@ -16,6 +18,7 @@ __all__ = [
     "VerifyReport",
     "audit",
     "derive",
+    "infer",
     "symmetries",
     "symmetrize",
     "symmetrize_with_report",
