@@ -108,7 +108,8 @@ def random_state(compiled, rng, height=0.4):
 def image_of(compiled, robot, data, g):
     """The state that the symmetry maps this one to, with the solver's warm start."""
     image = mujoco.MjData(compiled)
-    tensors = {name: torch.as_tensor(getattr(data, name)) for name in ("qpos", "qvel", "ctrl")}
+    tensors = {name: torch.as_tensor(getattr(data, name)) for name in ("qpos", "qvel", "ctrl", "act")}
+    image.act[:] = robot.map_act(tensors["act"], g)
     image.qpos[:] = robot.map_qpos(tensors["qpos"], g)
     image.qvel[:] = robot.map_qvel(tensors["qvel"], g)
     image.ctrl[:] = robot.map_ctrl(tensors["ctrl"], g)
