@@ -1,4 +1,4 @@
-"""Contact sensors: what has no order is mapped, what the solver orders is refused; sensors off the plane."""
+"""Contact sensors: what has no order is mapped, what the solver orders is not; sensors off the plane."""
 
 import mujoco
 import numpy as np

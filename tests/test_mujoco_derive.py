@@ -306,14 +306,6 @@ def test_subset_of_joints_and_readable_table():
     assert any(line.split() == ["LF_HAA", "LH_HAA", "-RF_HAA", "-RH_HAA"] for line in lines)
 
 
-@pytest.mark.parametrize("actuator", ['site="a" refsite="b" gear="0 0 1 0 0 0"', 'jointinparent="a"'])
-def test_actuators_in_other_frames_are_refused(actuator):
-    xml = f"""<mujoco><worldbody><site name="b"/><body><joint name="a" type="ball"/><geom size=".1"/>
-      <site name="a"/></body></worldbody><actuator><general name="m" {actuator}/></actuator></mujoco>"""
-    with pytest.raises(SymmetryError, match="m acts in another frame"):
-        derive(mujoco.MjModel.from_xml_string(xml), PointGroup.reflection("y"))
-
-
 def test_thrusters_on_welded_mounts_are_mapped_by_where_they_point():
     def mount(
         name: str, side: int, last: str
