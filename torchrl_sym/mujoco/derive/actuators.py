@@ -1,9 +1,9 @@
 """Images of actuators, which are mapped by what they drive.
 
-The sign says whether the image pushes the other way. A motor whose image nobody drives may be its own image,
-or that of another, through an equality constraint: one finger is driven, a constraint moves the other. Motors
-on slides that an element mixes mix as they do. What cannot be told is refused by actuator: it has no image,
-but everything else has.
+The sign says whether the image pushes the other way. A motor whose image nobody drives may be its own
+image, or that of another, through an equality constraint: one finger is driven, a constraint moves the
+other. Motors on slides that an element mixes mix as they do. What cannot be told is refused by actuator: it
+has no image, but everything else has.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def map_actuators(
         if cost[row, column] < _NONE:
             a, b = known[row], known[column]
             images[a] = Image(b, fits[a, b].sign, misfit=fits[a, b].misfit)
-            _add_offset(drives, images[a], a, drives.length(b))
+            _add_offset(drives, images[a], a, drives.shift(b))
 
     rest = [a for a in known if a not in images]
     taken = {image.index for image in images.values()}
@@ -78,16 +78,13 @@ def _gain_distance(model: MjModel, a: int, b: int) -> float:
     return distance
 
 
-def _add_offset(
-    drives: Transmissions, image: Image, a: int, length: Array | None, extra: float = 0.0
-) -> None:
-    """What is added to control and state of a servo, as its length goes to sign length + shift."""
-    if length is None or not drives.is_servo(a):
-        return
-    shift = float(length @ drives.offset) + extra
-    dynamics = int(drives.model.actuator_dyntype[a])
-    image.offset = 0.0 if dynamics == _INTEGRATOR else shift
-    image.state_offset = shift if dynamics in (*_FILTERS, _INTEGRATOR) else 0.0
+def _add_offset(drives: Transmissions, image: Image, a: int, shift: float) -> None:
+    """What is added to the length, and to control and state of a servo, which are lengths."""
+    image.length_offset = shift
+    if drives.is_servo(a):
+        dynamics = int(drives.model.actuator_dyntype[a])
+        image.offset = 0.0 if dynamics == _INTEGRATOR else shift
+        image.state_offset = shift if dynamics in (*_FILTERS, _INTEGRATOR) else 0.0
 
 
 def _mixed(drives: Transmissions, a: int) -> Image | None:
@@ -117,7 +114,7 @@ def _mixed(drives: Transmissions, a: int) -> Image | None:
     image = Image(max(weights, key=lambda b: abs(weights[b])), mixture=weights)
     sizes = [float(np.linalg.norm(parts[b])) for b in weights] + [float(np.linalg.norm(mine))]
     image.misfit = max(sizes) / min(sizes) - 1
-    _add_offset(drives, image, a, parts[image.index])
+    _add_offset(drives, image, a, drives.shift(image.index))
     return image
 
 
@@ -141,6 +138,6 @@ def _tied(drives: Transmissions, ties: Ties, a: int, free: list[int]) -> Image |
             if k is not None:
                 image = Image(b, sign, through=ties.words(model, k))
                 image.misfit = abs(float(sizes[0] / sizes[1]) - 1)
-                _add_offset(drives, image, a, sign * target, -sign * float(k @ ties.values))
+                _add_offset(drives, image, a, sign * float(target @ drives.offset - k @ ties.values))
                 found.append((_gain_distance(model, a, b), b != a, b, image))
     return min(found, key=lambda f: f[:3])[3] if found else None

@@ -49,7 +49,7 @@ class JointPairs:
 def pair_joints(
     parts: Parts, matrix: Array, mine: Sequence[int], theirs: Sequence[int], cost: Array
 ) -> JointPairs:
-    """Images of joints ``mine`` of a body among those of its image, ``theirs``; ``cost`` is that of pairs."""
+    """Images of joints ``mine`` of a body among those of its image, ``theirs``, by the cost of pairs."""
     ranks = np.abs(np.subtract.outer(np.arange(len(mine)), np.arange(len(theirs))))
     rows, columns = linear_sum_assignment(cost + _RANK * ranks)
     images = {mine[r]: theirs[c] for r, c in zip(rows, columns, strict=True)}

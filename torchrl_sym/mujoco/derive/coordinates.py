@@ -3,8 +3,8 @@
 With R the isometry, d its determinant, X_b the world rotation of body b at the reference pose and s(b)
 the image of link b, the part of the isometry that acts within the body frame is V_b = X_s(b)^T R X_b. Then
 
-- a hinge or slide coordinate becomes q'_s(j) = sign_j q_j + offset_j, with the sign from its axis; slides of
-  one body may mix instead, q'_k = sum_j w_jk q_j + offset_k;
+- a hinge or slide coordinate becomes q'_s(j) = sign_j q_j + offset_j, with the sign from its axis; slides
+  of one body may mix instead, q'_k = sum_j w_jk q_j + offset_k;
 - a free joint's position becomes R p + t, its rotation R X V_b^-1, its velocities R v (world) and d V_b w
   (body frame), where x -> R x + t is the isometry, t = (I - R) o for an axis through o. That is so if the
   image of the frame's origin is the origin of the image's frame; bodies for which it is not are astray: how

@@ -25,7 +25,7 @@ class Image:
         index: the image; of what is mixed, the one that it is compared with.
         sign: of the image's coordinate.
         offset: what is added to the image's coordinate (of an actuator, to its control).
-        state_offset: what is added to the internal state of an actuator.
+        length_offset, state_offset: what is added to the length and to the state of an actuator.
         mixture: of what has several images (motors of slides that a turn by 120 degrees mixes), the weight
             in each; empty if there is one.
         misfit: how far the image is from what it should be, relative; 0 in an exact model.
@@ -35,6 +35,7 @@ class Image:
     index: int
     sign: float = 1.0
     offset: float = 0.0
+    length_offset: float = 0.0
     state_offset: float = 0.0
     mixture: dict[int, float] = field(default_factory=dict)
     misfit: float = 0.0

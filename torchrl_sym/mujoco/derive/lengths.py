@@ -45,13 +45,20 @@ def tendon_length(model: MjModel, tendon: int) -> Array:
     return vector
 
 
+def coordinate_offsets(model: MjModel, map_: CoordinateMap) -> Array:
+    """What is added to the coordinates of hinges and slides, by velocity."""
+    offset = np.zeros(model.nv)
+    for j in map_.scalars:
+        offset[model.jnt_dofadr[j]] = map_.qpos_offset[model.jnt_qposadr[j]]
+    return offset
+
+
 def map_lengths(model: MjModel, map_: CoordinateMap, tendons: dict[int, Image]) -> tuple[Array, Array]:
     """The map Q of velocities and tendons, and what it adds to coordinates."""
     size = model.nv + model.ntendon
     matrix, offset = np.zeros((size, size)), np.zeros(size)
     matrix[: model.nv, : model.nv] = map_.qvel
-    for j in map_.scalars:
-        offset[model.jnt_dofadr[j]] = map_.qpos_offset[model.jnt_qposadr[j]]
+    offset[: model.nv] = coordinate_offsets(model, map_)
     for t, image in tendons.items():
         matrix[model.nv + image.index, model.nv + t] = image.sign
     return matrix, offset

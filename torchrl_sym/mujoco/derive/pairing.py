@@ -27,6 +27,7 @@ _MISFIT = 1e3  # cost of a pair that cannot be the image of each other; far abov
 _STAY = 1e-9  # links at one place stay where they are
 _UNDECIDED = 2e-2  # assignments whose costs differ by less are told apart by names and ranges
 _NAME, _RANGE = 3e-2, 2e-2  # what a name or a range that disagrees costs then
+_ORDER = 0.1  # joints that act in another order: less than a link on the wrong side
 _NEAREST = 8  # of many siblings, only so many near ones are compared in full
 # A link's centre of mass may miss its image's by so many tolerances (10 % of its tree, by default): enough
 # for cables and payloads of real robots, too little for a leg that is sent to itself across the plane.
@@ -233,7 +234,7 @@ class Pairing:
         cost += _MISFIT * (self._is_mocap(a) != self._is_mocap(b))
         joints = self.joint_pairs(a, b)
         cost += _MISFIT * (len(one.joints) != len(other.joints))
-        cost += sum(joints.costs.values()) + joints.order
+        cost += sum(joints.costs.values()) + _ORDER * joints.order
         if self._names is not None:
             cost += self._hint(a, b, joints.images)
         below, pairs = self.assign(one.children, other.children)
@@ -353,8 +354,8 @@ class Pairing:
         return (
             f"{label_of(self.model, 'body', a)} has no image under {element!r}: its joints, "
             f"{listed(self.links[a].joints)}, go to {listed(list(images.values()))} in this order, but "
-            f"{label_of(self.model, 'body', b)} has them in the order {listed(self.links[b].joints)}, and they "
-            "do not commute; list the joints of both bodies in the same order, or use a ball joint"
+            f"{label_of(self.model, 'body', b)} has them in the order {listed(self.links[b].joints)}, "
+            "and they do not commute; list the joints of both bodies in the same order, or use a ball joint"
         )
 
     def _can_be_carried(self, body: int) -> bool:

@@ -1,8 +1,8 @@
 """Paths of spatial tendons, compared part by part.
 
 A tendon's length is the sum over its branches (pulleys begin one) of their lengths divided by a divisor.
-Each branch runs straight from site to site, or around a sphere or cylinder between two of them: inside it if
-the side site is inside, else on the side that the direction of the side site says.
+Each branch runs straight from site to site, or around a sphere or cylinder between two of them: inside it
+if the side site is inside, else on the side that the direction of the side site says.
 """
 
 from __future__ import annotations

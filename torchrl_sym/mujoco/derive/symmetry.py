@@ -91,7 +91,7 @@ class ModelSymmetry:
         """Representation of the controls, relative to a pose that the group keeps.
 
         Raises:
-            ValueError: what an actuator drives is of a kind whose image cannot be told; the message names it.
+            ValueError: the image of what an actuator drives cannot be told; the message names it.
         """
         self._check_actuators()
         return represent(self.group, [action.ctrl for action in self.actions])
@@ -123,8 +123,8 @@ class ModelSymmetry:
                     if image not in place:
                         raise ValueError(
                             f"{element!r} sends {name_of(self.model, 'joint', j)} to "
-                            f"{name_of(self.model, 'joint', image)}, which is not among the joints asked for; "
-                            "add it"
+                            f"{name_of(self.model, 'joint', image)}, which is not among the joints asked "
+                            "for; add it"
                         )
                     matrix[place[image], place[j]] = weight
             matrices.append(matrix)
@@ -159,10 +159,7 @@ class ModelSymmetry:
 
     @functools.cached_property
     def _sensors(self) -> list[SensorMap]:
-        return [
-            SensorMapper(a.matcher, a.coordinates, a.tendons, a.actuators, a.tolerance).map()
-            for a in self.actions
-        ]
+        return [SensorMapper(action).map() for action in self.actions]
 
     @functools.cached_property
     def sensordata(self) -> Representation:
@@ -269,7 +266,7 @@ class ModelSymmetry:
         """Image of controls ``(..., nu)``, in the units of the actuators.
 
         Raises:
-            ValueError: what an actuator drives is of a kind whose image cannot be told; the message names it.
+            ValueError: the image of what an actuator drives cannot be told; the message names it.
         """
         return self._map_ctrl(ctrl, g)
 

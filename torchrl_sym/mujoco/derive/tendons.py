@@ -1,8 +1,8 @@
 """Images of tendons, which are mapped by what they couple.
 
-A fixed tendon is mapped by its joint coefficients, up to a common sign; those of slides that an element mixes
-mix. A spatial one is mapped by its path: branches, each in either direction, of sites and of the spheres and
-cylinders that it wraps around, on the side that the side site says.
+A fixed tendon is mapped by its joint coefficients, up to a common sign; those of slides that an element
+mixes mix. A spatial one is mapped by its path: branches, each in either direction, of sites and of the
+spheres and cylinders that it wraps around, on the side that the side site says.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
 from torchrl_sym.mujoco.derive.images import Image, SymmetryError, assign, mixture
-from torchrl_sym.mujoco.derive.lengths import is_fixed, tendon_length
+from torchrl_sym.mujoco.derive.lengths import coordinate_offsets, is_fixed, tendon_length
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.paths import path_gap, path_words
 from torchrl_sym.mujoco.model.types import Array, label_of
@@ -49,6 +49,9 @@ def map_tendons(matcher: Matcher, map_: CoordinateMap, tolerance: float) -> dict
             images[t] = Image(u, float(signs[t, u]), misfit=max(cost[t, u] - 1e-7 * (t != u), 0.0))
         else:
             images[t] = _mixed(matcher, map_, lengths, t)
+    shifts = coordinate_offsets(model, map_)
+    for image in images.values():
+        image.offset = float(lengths[image.index] @ shifts)
     return images
 
 
@@ -76,7 +79,7 @@ def _mixed(matcher: Matcher, map_: CoordinateMap, lengths: list[Array], t: int) 
     weights = mixture(map_.qvel @ lengths[t], parts) if map_.mixed else {}
     if not weights:
         raise SymmetryError(
-            f"{name} has no image: no tendon couples the images of what it couples; add the missing tendon, "
-            "or use a smaller group"
+            f"{name} has no image: no tendon couples the images of what it couples; add the missing "
+            "tendon, or use a smaller group"
         )
     return Image(max(weights, key=lambda u: abs(weights[u])), mixture=weights)

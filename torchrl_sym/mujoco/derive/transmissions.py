@@ -85,6 +85,11 @@ class Transmissions:
         vector[start : start + size] = gear[:size]
         return vector
 
+    def shift(self, a: int) -> float:
+        """What is added to the length of an actuator whose joints have offsets."""
+        length = self.length(a)
+        return 0.0 if length is None else float(length @ self.offset)
+
     def fits(self, known: list[int]) -> dict[tuple[int, int], Fit]:
         """Which actuators drive the images of what which do."""
         lengths = {a: length for a in known if (length := self.length(a)) is not None and length.any()}
