@@ -181,6 +181,7 @@ def test_speed_writes_its_figures(tmp_path):
     assert results["env"][0]["env_over_raw"] > 0
     assert {row["order"] for row in results["loss"]} == {1, 2, 4}
     assert {row["elements"] for row in results["augment"]} == {"all", "random"}
+    assert {"1000 boxes", "64 cubes", "cartpole"} <= {row["model"] for row in results["audit"]}
     assert {row["augmentation"] for row in results["iteration"]} == {"none", "all"}
 
 
