@@ -15,7 +15,7 @@ from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.derive.images import Image
 from torchrl_sym.mujoco.model.rotations import rotation
-from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, mj, name_of
+from torchrl_sym.mujoco.model.types import HINGE, Array, MjData, MjModel, mj, name_of
 
 _OBJECT = mj.mjtObj
 _EQ = mj.mjtEq
@@ -97,10 +97,14 @@ class _Constraints:
         """Points that a connect or weld joins, and the rotation that a weld asks for."""
         c, weld = self.c, int(self.c.model.eq_type[e]) == _WELD
         (owners, points, turned), (owners_f, points_f, turned_f) = self.ends[e], self.images[f]
-        turn, worst = c.matcher.matrix, 1.0
+        turn, worst, idle = c.matcher.matrix, 1.0, self._idle(owners_f)
         for order in ([0, 1], [1, 0]):
             if [c.map.bodies[owners[k]] for k in order] == owners_f:
-                apart = np.linalg.norm(points[order] @ turn.T - points_f, axis=1).max()
+                gaps = points[order] @ turn.T - points_f
+                apart = np.linalg.norm(gaps, axis=1).max()
+                if not weld and idle is not None:  # a constraint along the axis of all hinges does nothing
+                    gaps = gaps - np.outer(gaps @ idle, idle)
+                    apart = max(np.linalg.norm(gaps, axis=1).max(), min(apart, DISCRETE * c.matcher.extent))
                 beside = apart if weld else min(apart, self._beside(points[order] @ turn.T, f))
                 gap = max(beside, min(apart, DISCRETE * c.matcher.extent)) / c.matcher.extent
                 aligned = turned if order == [0, 1] else turned.T
@@ -108,6 +112,22 @@ class _Constraints:
                 gap = max(gap, abs(c.model.eq_data[e, 10] - c.model.eq_data[f, 10]) * weld)
                 worst = min(worst, float(gap))
         return worst
+
+    def _idle(self, owners: list[int]) -> Array | None:
+        """The axis of a planar linkage: of all hinges between two links, if they are parallel."""
+        model, chains = self.c.model, []
+        for link in owners:
+            chain = []
+            while link:
+                chain.append(link)
+                link = int(model.body_weldid[model.body_parentid[link]])
+            chains.append(chain)
+        between = set(chains[0]) ^ set(chains[1])
+        joints = np.flatnonzero(np.isin(model.jnt_bodyid, list(between)))
+        axes = self.c.image.xaxis[joints]
+        hinges = (model.jnt_type[joints] == HINGE).all()
+        parallel = len(joints) > 0 and np.abs(np.cross(axes, axes[0])).max() < 1e-6
+        return axes[0] if hinges and parallel else None
 
     def _beside(self, points: Array, f: int) -> float:
         """Distance of points from the hinge axis that f and others of its bodies close, if they do."""

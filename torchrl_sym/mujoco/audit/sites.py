@@ -1,9 +1,8 @@
 """Places of sites, judged by what uses them.
 
-Sites that actuators, tendons and constraints act at belong to the dynamics; those that sensors read belong
+Those that actuators, tendons and constraints act at are compared with these. Sites that sensors read belong
 to the observation: a robot whose accelerometer sits beside the middle plane moves symmetrically. A gyro
-reads the same wherever it sits on its link. Which way a tendon passes round a geom is up to the side on
-which a *side site* lies, not to its distance.
+reads the same wherever it sits on its link.
 """
 
 from __future__ import annotations
@@ -58,11 +57,9 @@ def compare_sites(c: Comparison) -> list[str]:
                 one = _support(model, c.data, a, DIRECTIONS @ turn)
                 size = np.abs(one - _support(model, c.image, b, DIRECTIONS)).max()
                 residual = max(residual, float(size) / c.matcher.extent)
-        if a in acting:
-            c.add("sites", min(residual, 1.0), name)
-        elif a in read:
+        if a in read:
             c.add("sensor sites", min(residual, 1.0), name, kind="observation")
-        elif residual > 1e-6 and a not in placeless:
+        elif residual > 1e-6 and a not in placeless | acting:
             loose.append(name)
     return loose
 

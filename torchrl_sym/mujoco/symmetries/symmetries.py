@@ -27,6 +27,7 @@ from torchrl_sym.mujoco.symmetries.report import Candidate, SymmetriesReport
 MOST_FOLD = 12
 _USUAL_FOLD = 4  # half, third and quarter turns are reported even where they fail
 _TURNED = "turned by"  # in the words for a pose: a free base was turned to suit the group
+_NEAR_PLANE = 10.0  # of planes nearer than this to each other, only the better one counts
 _SAME_PLANE = 0.5  # degrees; candidate planes nearer than this to one that was found are that one
 
 
@@ -134,11 +135,21 @@ class _Search:
         found: dict[float, Candidate] = {}
         for angle in candidate_planes(self.model, reference_pose(self.model, self.keyframe)):
             usual = angle in (0.0, 90.0)
-            apart = [abs((angle - other + 90 / fold) % (180 / fold) - 90 / fold) for other in found]
-            if usual or min(apart, default=180.0) > _SAME_PLANE:
+            apart = {other: abs((angle - other + 90 / fold) % (180 / fold) - 90 / fold) for other in found}
+            near = min(apart, key=lambda other: apart[other], default=None)
+            if usual or near is None or apart[near] > _SAME_PLANE:
                 candidate = self.examine(PointGroup.reflection(angle), usual)
-                if candidate.found:
+                if not candidate.found:
+                    continue
+                if (
+                    usual
+                    or near is None
+                    or apart[near] > _NEAR_PLANE
+                    or _misfit(candidate) < _misfit(found[near])
+                ):
                     found[angle] = candidate
+                else:  # a plane that is nearly a better one
+                    del self.tried[candidate.name]
         return found
 
     def largest(
@@ -158,6 +169,11 @@ class _Search:
                 if faithful.order > 1:
                     return faithful
         return PointGroup.trivial()
+
+
+def _misfit(candidate: Candidate) -> float:
+    worst = candidate.report.worst
+    return 0.0 if worst is None else worst.residual
 
 
 def _moves(robot: ModelSymmetry, g: int) -> bool:
