@@ -9,7 +9,8 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.sensor_rules import POSES
-from torchrl_sym.mujoco.model.shapes import DIRECTIONS, active_geoms, support
+from torchrl_sym.mujoco.model.filters import active_geoms
+from torchrl_sym.mujoco.model.shapes import DIRECTIONS, supports
 from torchrl_sym.mujoco.model.types import Array, MjData
 
 MISFIT = 1e6  # of a pair that cannot be the image of each other
@@ -53,7 +54,8 @@ class Places:
 
         def reach(pose: MjData, site: int, directions: Array) -> Array:
             rotation, kind = pose.site_xmat[site].reshape(3, 3), int(self.model.site_type[site])
-            return support(kind, self.model.site_size[site], pose.site_xpos[site], rotation, directions)
+            size, place = self.model.site_size[[site]], pose.site_xpos[[site]]
+            return supports(kind, size, place, rotation[None], directions)[0]
 
         away = reach(self.data, a, DIRECTIONS @ self.turn) - reach(self.image, b, DIRECTIONS)
         return float(np.abs(away).max()) / self.matcher.size(self.link("SITE", b))
