@@ -159,7 +159,7 @@ def test_what_reads_the_same_everywhere_may_be_anywhere(sensor):
 def test_the_site_of_an_actuator_belongs_to_the_dynamics():
     thruster = '<general site="imu" gear="1 0 0 0 0 0"/>'
     model = with_site('<accelerometer site="imu"/>', thruster, place="0 -.002 0")
-    row = row_of(audit(model, MIRROR), "sites")
+    row = row_of(audit(model, MIRROR), "transmission")
     assert row.kind == "dynamics" and row.residual > 1e-4
 
 

@@ -57,6 +57,9 @@ def compare_sites(c: Comparison) -> list[str]:
                 one = _support(model, c.data, a, DIRECTIONS @ turn)
                 size = np.abs(one - _support(model, c.image, b, DIRECTIONS)).max()
                 residual = max(residual, float(size) / c.matcher.extent)
+        if a in acting and b is not None:
+            lengths = np.linalg.norm(model.site_quat[[a, b]], axis=1)
+            c.add("site rotation", abs(float(lengths[0] - lengths[1])), name)
         if a in read:
             c.add("sensor sites", min(residual, 1.0), name, kind="observation")
         elif residual > 1e-6 and a not in placeless | acting:
