@@ -39,10 +39,24 @@ class Standing:
 def stand(parts: Parts, group: PointGroup, origin: Array, tolerance: float) -> Standing:
     """Find it for every loose tree of a model at a pose; the group acts about the axis through origin."""
     out = Standing(images=[{} for _ in range(group.order)])
-    turning = Turning(parts, group.matrices.numpy(), tolerance)
+    turning = Turning(parts, group.matrices.numpy(), generators(group), tolerance)
     for alike in _buckets(turning):
         _stand_alike(turning, group, origin, alike, out)
     return out
+
+
+def generators(group: PointGroup) -> list[int]:
+    """A few elements whose products are the group: what fits them fits all."""
+    found, reached = [], {0}
+    for g in range(1, group.order):
+        if g not in reached:
+            found.append(g)
+            while True:
+                more = {int(group.table[a, b]) for a in found for b in reached} - reached
+                if not more:
+                    break
+                reached |= more
+    return found
 
 
 def _stand_alike(
@@ -72,7 +86,7 @@ def _stand_alike(
 
 def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
     """Misfit, words, turn and point with which a tree is its own image, the first that is good enough."""
-    elements, zero = range(1, len(turning.matrices)), np.zeros(3)
+    elements, zero = turning.generators, np.zeros(3)
     tried: list[tuple[float, str, Array, Array]] = []
 
     def attempt(by: Turning, words: str, turn: Array, point: Array) -> bool:
@@ -89,7 +103,7 @@ def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
     if min(tried, key=_misfit)[0] > 1 and not held:  # the frame may be anywhere in the body
         for point in _points(turning, tree):
             about = turning.parts.about({tree: turning.parts.points[tree] + point})
-            by = Turning(about, turning.matrices, turning.tolerance)
+            by = Turning(about, turning.matrices, turning.generators, turning.tolerance)
             if any(attempt(by, *usual, point) for usual in by.usual(tree)):
                 return tried[-1]
             turning.held |= by.held
@@ -114,7 +128,8 @@ def _points(turning: Turning, tree: int) -> list[Array]:
     about = parts.about({tree: parts.points[tree] + mass})
     found = [mass]
     for _, turn in turning.usual(tree):
-        pairings = [Pairing(about, turn.T @ m @ turn, m) for m in turning.matrices[1:]]
+        elements = turning.matrices[turning.generators]
+        pairings = [Pairing(about, turn.T @ m @ turn, m) for m in elements]
         moved = center((p, p.images(tree, tree)) for p in pairings)
         found.append(mass + moved)
     return found[:1] + [p for p in found[1:] if np.isfinite(p).all()]

@@ -43,9 +43,6 @@ class Misfit:
     one: int = 0
     other: int = 0
 
-    def __str__(self) -> str:
-        return f"{self.kind} {self.one} -> {self.other}: {self.size:.2g}"
-
 
 class Pairing:
     """Finds images under one isometry.
@@ -343,7 +340,7 @@ class Pairing:
         return (
             f"{label_of(model, 'joint', a)} has no image under {element!r}: the nearest, "
             f"{label_of(model, 'joint', b)}, misses it by {np.degrees(turn):.2g} degrees and "
-            f"{1e3 * away:.2g} mm ({limit})"
+            f"{1e3 * away:.3g} mm ({limit})"
         )
 
     def _explain_order(self, a: int, b: int, element: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.axis import find_axis
 from torchrl_sym.mujoco.derive.images import SymmetryError
-from torchrl_sym.mujoco.derive.loose import Standing, stand
+from torchrl_sym.mujoco.derive.loose import Standing, generators, stand
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.solving import solved
@@ -107,7 +107,7 @@ class Search:
     def _at(self, pose: Pose) -> Stance:
         model, parts = self.model, Parts.of(self.model, kinematics(self.model, pose), self.carried)
         if self.axis is None:
-            axis = find_axis(parts, self.matrices[1:], self.tolerance)[0]
+            axis = find_axis(parts, self.matrices[generators(self.group)], self.tolerance)[0]
         else:
             axis = np.array([*self.axis, 0.0])
         standing = stand(parts, self.group, axis, self.tolerance)

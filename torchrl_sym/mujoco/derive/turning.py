@@ -33,11 +33,13 @@ class Turning:
     Args:
         parts: the model at a pose.
         matrices: the group's elements, ``(n, 3, 3)``.
+        generators: elements that are tried.
         tolerance: of the pairs of joints.
     """
 
-    def __init__(self, parts: Parts, matrices: Array, tolerance: float) -> None:
+    def __init__(self, parts: Parts, matrices: Array, generators: list[int], tolerance: float) -> None:
         self.parts, self.model, self.matrices, self.tolerance = parts, parts.model, matrices, tolerance
+        self.generators = generators
         # trees whose first joints have images in some turn: then it is the pose, if others have none
         self.held: set[int] = set()
 
