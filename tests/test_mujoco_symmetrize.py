@@ -156,7 +156,7 @@ def test_offsets_frames_welded_bodies_capsules_and_boxes(keyframe):
     assert robot.table("joint", 1)["a"] == "b"
     assert max(step_residual(compiled, robot, 1, seed, steps=5)[0] for seed in range(6)) <= 1e-9
     found = audit(compiled, group, keyframe)
-    assert not found.exact
+    assert "scenery: not a symmetry (1: scenery geometry, reflect-y, lidar" in found.verdict
     assert "left alone: geom 'lidar' has no image" in str(report)
     assert compiled.body_mass.sum() == pytest.approx(spec.compile().body_mass.sum())
     after.delete(after.geom("lidar"))
