@@ -8,6 +8,7 @@ from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
 from torchrl_sym.mujoco.derive.images import Image
 from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, mj, name_of
 
@@ -96,7 +97,7 @@ def _ends(model: MjModel, data: MjData, e: int) -> tuple[list[int], Array, Array
         bodies, frames = np.array([one, other]), data.xmat[[one, other]].reshape(2, 3, 3)
         anchors = [prm[3:6], prm[:3]] if kind == _WELD else [prm[:3], prm[3:6]]
         points = data.xpos[bodies] + np.einsum("kij,kj->ki", frames, np.array(anchors))
-    owners = [int(model.body_weldid[body]) for body in bodies]
+    owners = [int(weld_ids(model)[body]) for body in bodies]
     if kind != _WELD:
         return owners, points, np.eye(3)
     relative = np.eye(3) if by_site else rotation(prm[6:10])

@@ -11,6 +11,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.audit.comparison import column_scale
 from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, active_geoms, support, touching
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, mj, name_of
 
@@ -82,7 +83,7 @@ def _geom_images(
     add: Add,
 ) -> dict[int, int]:
     images: dict[int, int] = {}
-    owner = model.body_weldid[model.geom_bodyid[active]]
+    owner = weld_ids(model)[model.geom_bodyid[active]]
     for link, link_image in bodies.items():
         mine, theirs = active[owner == link], active[owner == link_image]
         cost = np.array([[shape_residual(model, data, matcher, a, b) for b in theirs] for a in mine])

@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
 from torchrl_sym.mujoco.derive.images import Image, SymmetryError
 from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import BALL, FREE, Array, MjModel, mj, name_of
 
 _TRANSMISSION = {
@@ -81,11 +82,7 @@ def _transmission_sign(
         scalar = tendon.sign * np.sign(gear[0] * gear_other[0])
         return float(scalar) if tendon.index == other else None
     if kind == "body":
-        return (
-            1.0
-            if map_.bodies.get(int(model.body_weldid[target])) == int(model.body_weldid[other])
-            else None
-        )
+        return 1.0 if map_.bodies.get(int(weld_ids(model)[target])) == int(weld_ids(model)[other]) else None
     if kind == "site":
         if sites.get(target) != other:
             return None

@@ -24,6 +24,7 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.model.links import Link
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import conjugate, product, sandwich
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, MjData, MjModel
 
@@ -114,7 +115,7 @@ def map_coordinates(
 
 def _frame_owner(model: MjModel, body: int) -> int:
     """The link that a body's parent belongs to."""
-    return int(model.body_weldid[model.body_parentid[body]])
+    return int(weld_ids(model)[model.body_parentid[body]])
 
 
 def _at_zero(data: MjData, model: MjModel, body: int, joint: int) -> Array:

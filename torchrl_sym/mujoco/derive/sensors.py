@@ -25,6 +25,7 @@ from torchrl_sym.mujoco.derive.sensor_rules import (
     _TYPES,
     _UNSUPPORTED,
 )
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import conjugate, product, quaternion, sandwich
 from torchrl_sym.mujoco.model.types import BALL, Array, MjModel, mj, name_of
 
@@ -214,7 +215,7 @@ class SensorMapper:
 
     def _body_misfit(self, a: int, b: int) -> float:
         """The same for whole bodies: one that moves a link, or a part welded to it, by its mass centre."""
-        welds = self.model.body_weldid
+        welds = weld_ids(self.model)
         if int(welds[a]) == a or int(welds[b]) == b:
             return 0.0 if self.coordinates.bodies.get(a) == b else _MISFIT
         return self._place_misfit("BODY", a, b)
@@ -349,7 +350,7 @@ class SensorMapper:
     def _link(self, kind: str, index: int) -> int:
         owners = {"SITE": "site_bodyid", "GEOM": "geom_bodyid", "CAMERA": "cam_bodyid"}
         body = int(getattr(self.model, owners[kind])[index]) if kind in owners else index
-        return int(self.model.body_weldid[body])
+        return int(weld_ids(self.model)[body])
 
     def _rotations(self, one: tuple[str, int], other: tuple[str, int]) -> tuple[Array, Array]:
         start, end = getattr(self.data, _POSES[one[0]][1]), getattr(self.image, _POSES[other[0]][1])

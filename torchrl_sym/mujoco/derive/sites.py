@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import MjData, MjModel
 
 
@@ -14,7 +15,7 @@ def map_sites(
 ) -> dict[int, int]:
     """Image of every site that has one: on the image link, where R sends it."""
     images: dict[int, int] = {}
-    owner = model.body_weldid[model.site_bodyid]
+    owner = weld_ids(model)[model.site_bodyid]
     for a, b in bodies.items():
         mine, theirs = np.flatnonzero(owner == a), np.flatnonzero(owner == b)
         if not len(mine) or not len(theirs):
