@@ -14,14 +14,14 @@ import sys
 import tempfile
 from pathlib import Path
 
+DM_CONTROL = sys.version_info < (3, 13)  # it needs labmaze, which has no wheel for later ones
 # The parts that an environment with one extra lacks something for, and the extra that has it.
 LACKS = {
     "core": {"torchrl_sym.mujoco": "mujoco", "torchrl_sym.recipes": "train", "tasks": "tasks"},
     "mujoco": {"torchrl_sym.recipes": "train", "tasks.paths": "tasks", "tasks.rendering": "tasks"},
-    "tasks": {"torchrl_sym.recipes": "train"},
+    "tasks": {} if DM_CONTROL else {"torchrl_sym.recipes": "train"},  # dm_control brings tqdm
     "train": {"torchrl_sym.mujoco": "mujoco", "tasks": "tasks"},
 }
-DM_CONTROL = sys.version_info < (3, 13)  # it needs labmaze, which has no wheel for later ones
 ROBOT = """<mujoco><worldbody>
   <geom type="plane" size="5 5 .1"/>
   <body name="base" pos="0 0 .3"><freejoint/><geom type="box" size=".2 .1 .05"/>
