@@ -22,7 +22,7 @@ MAX_LINES = 400
 # Reading order is dependency order. A module imports from its own layer (without cycles) and from
 # the layers above it in this list. `__init__` collects them all, so none of them imports it.
 LAYERS = (
-    "checks _torchrl",
+    "checks extras _torchrl",
     "groups",
     "representations",
     "entries normalization segments",

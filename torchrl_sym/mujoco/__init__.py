@@ -1,5 +1,9 @@
 """Symmetry of MuJoCo models: find, derive, audit, symmetrize and verify it, infer that of observations."""
 
+from torchrl_sym.extras import require
+
+require("torchrl_sym.mujoco", "mujoco", {"mujoco": "3.11", "scipy": ""})
+
 from torchrl_sym.mujoco.audit import AuditReport, audit
 from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
 from torchrl_sym.mujoco.infer import InferenceError, infer

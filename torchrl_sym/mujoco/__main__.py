@@ -11,6 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
+from torchrl_sym.extras import require
+
+try:
+    require("python -m torchrl_sym.mujoco", "mujoco", {"tyro": ""})
+except ImportError as error:
+    sys.exit(str(error))
+
 import tyro
 
 from torchrl_sym import checks

@@ -14,6 +14,7 @@ import numpy as np
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.derive.images import Image
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.types import HINGE, Array, MjData, MjModel, mj, name_of
 
@@ -120,7 +121,7 @@ class _Constraints:
             chain = []
             while link:
                 chain.append(link)
-                link = int(model.body_weldid[model.body_parentid[link]])
+                link = int(weld_ids(model)[model.body_parentid[link]])
             chains.append(chain)
         between = set(chains[0]) ^ set(chains[1])
         joints = np.flatnonzero(np.isin(model.jnt_bodyid, list(between)))
@@ -165,7 +166,7 @@ def _ends(model: MjModel, data: MjData, e: int) -> tuple[list[int], Array, Array
         bodies, frames = np.array([one, other]), data.xmat[[one, other]].reshape(2, 3, 3)
         anchors = [prm[3:6], prm[:3]] if kind == _WELD else [prm[:3], prm[3:6]]
         points = data.xpos[bodies] + np.einsum("kij,kj->ki", frames, np.array(anchors))
-    owners = [int(model.body_weldid[body]) for body in bodies]
+    owners = [int(weld_ids(model)[body]) for body in bodies]
     if kind != _WELD:
         return owners, points, np.eye(3)
     relative = np.eye(3) if by_site else rotation(prm[6:10])

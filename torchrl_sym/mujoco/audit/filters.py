@@ -13,6 +13,7 @@ from torchrl_sym.mujoco.audit.comparison import Comparison, column_scale
 from torchrl_sym.mujoco.audit.encounters import Encounters
 from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.model.filters import Filters, feels_fluid, geom_label
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, name_of
 
 _PARAMETERS = {
@@ -38,7 +39,7 @@ def compare_contacts(c: Comparison, images: dict[int, int]) -> None:
 
 def _compare_parameters(c: Comparison, mine: NDArray[np.intp], theirs: NDArray[np.intp]) -> None:
     """Friction, softness and margins of geoms, judged with their shapes."""
-    world = c.model.body_weldid[c.model.geom_bodyid[mine]] == 0
+    world = weld_ids(c.model)[c.model.geom_bodyid[mine]] == 0
     for kind, some in (("collision", ~world), ("scenery", world)):
         for term, fields in _PARAMETERS.items():
             gaps = [_gap(c, field, mine[some], theirs[some]) for field in fields if hasattr(c.model, field)]

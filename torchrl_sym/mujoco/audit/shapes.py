@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.pairing import pair
 from torchrl_sym.mujoco.model.filters import active_geoms, feels_fluid, geom_label, lonely_geoms
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, SOLID, geom_supports
 from torchrl_sym.mujoco.model.surfaces import outside, surface_points
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, name_of
@@ -90,7 +91,7 @@ def _untouched(model: MjModel, lonely: Numbers) -> str:
 
 def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
     model, turn, extent = c.model, c.matcher.matrix, c.matcher.extent
-    world = model.body_weldid[model.geom_bodyid[geoms]] == 0
+    world = weld_ids(model)[model.geom_bodyid[geoms]] == 0
     return Shapes(
         geoms,
         np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision")),
@@ -113,7 +114,7 @@ def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, extent:
 
 def _places(model: MjModel, geoms: Numbers) -> dict[int, dict[int, Numbers]]:
     """Where the geoms of each link are in an array of geoms, by their types."""
-    owner, places = model.body_weldid[model.geom_bodyid[geoms]], defaultdict(lambda: defaultdict(list))
+    owner, places = weld_ids(model)[model.geom_bodyid[geoms]], defaultdict(lambda: defaultdict(list))
     for i, (link, kind) in enumerate(zip(owner.tolist(), model.geom_type[geoms].tolist(), strict=True)):
         places[link][kind].append(i)
     return {link: {kind: np.array(some) for kind, some in kinds.items()} for link, kinds in places.items()}
@@ -189,8 +190,8 @@ def _name(c: Comparison, s: Shapes, i: int) -> str:
     other = int(s.images[i])
     if other >= 0:
         return label if other == geom else f"{label} -> {geom_label(c.model, other)}"
-    link = c.map.bodies[int(c.model.body_weldid[c.model.geom_bodyid[geom]])]
-    owner = c.model.body_weldid[c.model.geom_bodyid[s.geoms]]
+    link = c.map.bodies[int(weld_ids(c.model)[c.model.geom_bodyid[geom]])]
+    owner = weld_ids(c.model)[c.model.geom_bodyid[s.geoms]]
     candidates = np.flatnonzero((owner == link) & (c.model.geom_type[s.geoms] == c.model.geom_type[geom]))
     if not len(candidates):
         return f"{label} (no image)"

@@ -60,7 +60,7 @@ def simulation_warnings(model: MjModel, group: PointGroup) -> tuple[str, ...]:
 
 def _can_yaw(model: MjModel) -> bool:
     """Whether a body floats in the plane and turns about the vertical axis."""
-    for body in np.flatnonzero((model.body_weldid[model.body_parentid] == 0) & (model.body_jntnum > 0)):
+    for body in np.flatnonzero((weld_ids(model)[model.body_parentid] == 0) & (model.body_jntnum > 0)):
         joints = int(model.body_jntadr[body]) + np.arange(int(model.body_jntnum[body]))
         kinds = model.jnt_type[joints]
         turns = (kinds == BALL) | ((kinds == HINGE) & (np.abs(model.jnt_axis[joints, 2]) > 0.5))

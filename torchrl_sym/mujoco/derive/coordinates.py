@@ -183,7 +183,7 @@ def _mix(out: CoordinateMap, matcher: Matcher, a: int, weights: Array) -> None:
 
 def _frame_owner(model: MjModel, body: int) -> int:
     """The link that a body's parent belongs to."""
-    return int(model.body_weldid[model.body_parentid[body]])
+    return int(weld_ids(model)[model.body_parentid[body]])
 
 
 def _at_zero(data: MjData, model: MjModel, body: int, joint: int) -> Array:

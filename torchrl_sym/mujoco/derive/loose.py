@@ -18,6 +18,7 @@ from torchrl_sym.mujoco.derive.names import counterparts, exchanged
 from torchrl_sym.mujoco.derive.pairing import Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.turning import Turning
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, label_of, name_of
 
 _GOOD = 1e-4  # a fit below this, in tolerances, needs no better one
@@ -185,7 +186,7 @@ def _buckets(turning: Turning) -> list[list[int]]:
 def _reach(parts: Parts, tree: int) -> float:
     """How far a tree's shapes reach from its frame, however it is turned."""
     model = parts.model
-    geoms = np.flatnonzero(np.isin(model.body_weldid[model.geom_bodyid], parts.tree(tree)))
+    geoms = np.flatnonzero(np.isin(weld_ids(model)[model.geom_bodyid], parts.tree(tree)))
     away = np.linalg.norm(parts.data.geom_xpos[geoms] - parts.data.xpos[tree], axis=1)
     return float((away + model.geom_rbound[geoms]).max(initial=0.0))
 

@@ -10,6 +10,7 @@ import numpy as np
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.sensor_rules import POSES
 from torchrl_sym.mujoco.model.filters import active_geoms
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, supports
 from torchrl_sym.mujoco.model.types import Array, MjData
 
@@ -29,7 +30,7 @@ class Places:
         """The link that an object is on."""
         owners = {"SITE": "site_bodyid", "GEOM": "geom_bodyid", "CAMERA": "cam_bodyid"}
         body = int(getattr(self.model, owners[kind])[index]) if kind in owners else index
-        return int(self.model.body_weldid[body])
+        return int(weld_ids(self.model)[body])
 
     def gap(self, kind: str, a: int, b: int) -> float:
         """Distance of object b from the image of a, on its link."""
@@ -42,7 +43,7 @@ class Places:
 
     def body_gap(self, a: int, b: int) -> float:
         """The same for whole bodies: one that moves a link, or a part welded to it, by its mass centre."""
-        welds = self.model.body_weldid
+        welds = weld_ids(self.model)
         if int(welds[a]) == a or int(welds[b]) == b:
             return 0.0 if self.matcher.images.get(a) == b else MISFIT
         return self.gap("BODY", a, b)

@@ -17,6 +17,7 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.pairing import Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, geom_supports
 from torchrl_sym.mujoco.model.types import Array, mj
@@ -131,7 +132,7 @@ class Turning:
     def _hull(self, tree: int, directions: Array) -> Array:
         """Support function, about its point, of what may collide on a tree's first link, else of all."""
         model = self.model
-        geoms = np.flatnonzero((model.body_weldid[model.geom_bodyid] == tree) & (model.geom_type != PLANE))
+        geoms = np.flatnonzero((weld_ids(model)[model.geom_bodyid] == tree) & (model.geom_type != PLANE))
         touching = geoms[(model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)]
         geoms = touching if len(touching) else geoms
         if not len(geoms):

@@ -12,6 +12,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import MjModel, mj, name_of
 
 _DISABLE = mj.mjtDisableBit
@@ -37,14 +38,14 @@ class Filters:
         self.body, self.bits = unique[:, 0], unique[:, 1:]
         contype, conaffinity = self.bits.T
         off = model.opt.disableflags & int(_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT)
-        link = model.body_weldid[self.body]
+        link = weld_ids(model)[self.body]
         self.moves: NDArray[np.bool_] = link != 0
         self.alike: NDArray[np.bool_] = (contype[:, None] & conaffinity) != 0
         self.alike |= self.alike.T
         active = model.body_dofnum[link] > 0  # a mocap body moves, but nothing can push it
         self.alike &= (link[:, None] != link) & (active[:, None] | active) & (not off)
         if not model.opt.disableflags & int(_DISABLE.mjDSBL_FILTERPARENT):
-            parent = model.body_weldid[model.body_parentid[link]]
+            parent = weld_ids(model)[model.body_parentid[link]]
             child = (parent[:, None] == link) & self.moves & self.moves[:, None]
             self.alike &= ~(child | child.T)
         self.excluded = np.zeros_like(self.alike)

@@ -83,7 +83,7 @@ class Averager:
     def closed(self, maps: Maps, kind: str) -> Maps:
         """The part of the maps on which the group acts; what has no image is noted in the report."""
         table = self.group.table
-        owner = self.model.body_weldid[getattr(self.model, f"{kind}_bodyid")]
+        owner = weld_ids(self.model)[getattr(self.model, f"{kind}_bodyid")]
         own = {a for a, body in enumerate(owner) if int(body) in self.carried}
         everything = set().union(*maps) - own
         good = {
@@ -147,7 +147,7 @@ class Averager:
 
     def in_body(self, body: int, place: Array) -> Array:
         """A world position in the frame of a body, where that ends up."""
-        origin = self.data.xpos[body] + self.moved[int(self.model.body_weldid[body])]
+        origin = self.data.xpos[body] + self.moved[int(weld_ids(self.model)[body])]
         return self.rotation[body].T @ (place - origin)
 
 

@@ -62,6 +62,6 @@ def _write_body(averager: Averager, body: int, joints: list[int], anchors: dict,
         turn = turn @ rotation(q).T
         place = anchors[j] - turn @ at
     parent = int(model.body_parentid[body])
-    base = data.xpos[parent] + averager.moved[int(model.body_weldid[parent])]
+    base = data.xpos[parent] + averager.moved[int(weld_ids(model)[parent])]
     outer = averager.rotation[parent]
     averager.pose(averager.spec.bodies[body], outer.T @ (place - base), outer.T @ turn, "body", name)
