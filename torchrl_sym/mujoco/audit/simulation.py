@@ -12,6 +12,7 @@ import numpy as np
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.audit.contacts import contact_warnings
 from torchrl_sym.mujoco.model.filters import active_geoms
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, MjModel, mj, name_of
 
 _OPAQUE = {

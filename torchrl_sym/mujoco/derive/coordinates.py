@@ -28,6 +28,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import conjugate, product, rotation, sandwich
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, MjData, MjModel
 

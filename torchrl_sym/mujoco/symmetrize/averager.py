@@ -17,6 +17,7 @@ from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.derive import derive
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import quaternion, rotation
 from torchrl_sym.mujoco.model.types import Array, label_of, mj, name_of
 from torchrl_sym.mujoco.symmetrize.report import Change, SymmetrizeReport

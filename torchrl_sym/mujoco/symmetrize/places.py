@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.types import BALL, HINGE, SLIDE, mj, name_of
 from torchrl_sym.mujoco.symmetrize.averager import Averager, frame_of
