@@ -16,11 +16,14 @@ from pathlib import Path
 
 DM_CONTROL = sys.version_info < (3, 13)  # it needs labmaze, which has no wheel for later ones
 # The parts that an environment with one extra lacks something for, and the extra that has it.
+OF_MUJOCO = dict.fromkeys(
+    ["torchrl_sym.mujoco", "torchrl_sym.bridges.frames", "torchrl_sym.bridges.mjlab"], "mujoco"
+)
 LACKS = {
-    "core": {"torchrl_sym.mujoco": "mujoco", "torchrl_sym.recipes": "train", "tasks": "tasks"},
+    "core": OF_MUJOCO | {"torchrl_sym.recipes": "train", "tasks": "tasks"},
     "mujoco": {"torchrl_sym.recipes": "train", "tasks.paths": "tasks", "tasks.rendering": "tasks"},
     "tasks": {} if DM_CONTROL else {"torchrl_sym.recipes": "train"},  # dm_control brings tqdm
-    "train": {"torchrl_sym.mujoco": "mujoco", "tasks": "tasks"},
+    "train": OF_MUJOCO | {"tasks": "tasks"},
 }
 ROBOT = """<mujoco><worldbody>
   <geom type="plane" size="5 5 .1"/>

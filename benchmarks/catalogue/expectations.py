@@ -7,11 +7,12 @@ something it does not know of.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+
+import tomllib
 
 HERE = Path(__file__).parent
 VERDICTS = ("exact", "approximate", "no", "cannot tell", "nothing")

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
+
+import tomllib
 
 from catalogue.examine import Row
 from catalogue.expectations import HERE, Expectation, expectation
