@@ -52,7 +52,7 @@ def compare_joints(c: Comparison) -> None:
 
 
 def _compare_mixing(c: Comparison, i: int, name: str) -> None:
-    """A slide whose coordinate enters those of several: what its axis becomes, and whether a box limits it."""
+    """A slide whose coordinate enters those of several: what its axis becomes; no box may limit it."""
     axes = sum(weight * c.data.xaxis[k] for k, weight in c.map.mixed[i].items())
     c.add("joint axis", float(np.linalg.norm(c.matcher.matrix @ c.data.xaxis[i] - axes)), name)
     for term, limited in (("joint range", "jnt_limited"), ("joint force range", "jnt_actfrclimited")):
