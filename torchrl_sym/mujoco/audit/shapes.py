@@ -26,7 +26,9 @@ from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, name_of
 
 # What no number measures: other pieces of one surface, a filter between parts that do not meet.
 DISCRETE = 1e-2
-_STICKS_OUT = 0.1  # of its bounding radius: by so much a geom that others cover may reach beyond them
+# By how much of its bounding radius a geom may reach beyond others that cover it: a foot that is missing
+# reaches farther. Pieces of a mesh are cut by chance, so that they may by more, if it is little of the robot.
+_STICKS_OUT, _PIECE, _A_LITTLE = 0.1, 0.5, 0.04
 _TERMS = {"collision": "collision geometry", "scenery": "scenery geometry", "dynamics": "fluid geometry"}
 
 Numbers = NDArray[np.intp]
@@ -160,7 +162,9 @@ def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict
     for i in rest[np.argsort(-s.gaps[rest], kind="stable")]:
         geom = int(s.geoms[i])
         reach = _reach(c, geom, s.geoms[cover])
-        if reach > _STICKS_OUT * c.model.geom_rbound[geom] or reach / c.matcher.extent > s.gaps[i] / 2:
+        radius, extent = c.model.geom_rbound[geom], c.matcher.extent
+        allowed = max(_STICKS_OUT * radius, min(_PIECE * radius, _A_LITTLE * extent))
+        if reach > allowed or reach / c.matcher.extent > s.gaps[i] / 2:
             return
         s.gaps[i] = reach / c.matcher.extent
         nearest = cover[np.abs(s.theirs[cover] - s.mine[i]).max(axis=1).argmin()]
