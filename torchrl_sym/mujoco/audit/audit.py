@@ -44,7 +44,7 @@ from torchrl_sym.mujoco.audit.simulation import simulation_warnings, unchecked_e
 from torchrl_sym.mujoco.audit.sites import compare_sites
 from torchrl_sym.mujoco.audit.tendons import compare_tendons
 from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
-from torchrl_sym.mujoco.model.types import MjModel, check_model
+from torchrl_sym.mujoco.model.types import MjModel
 
 _STILL = (
     "nothing in the model can move; a robot whose root is nailed to the world, as every URDF's is, needs a "
@@ -87,7 +87,6 @@ def audit(
         >>> audit(model, PointGroup.reflection("y")).verdict
         'approximate (largest residual 0.02: inertia, reflect-y, ...)'
     """
-    check_model(model)
     tolerance, group = checks.real("tolerance", tolerance, 0.0), check_group(group)
     try:
         symmetry = derive(model, group, keyframe, axis=axis, carried=carried)

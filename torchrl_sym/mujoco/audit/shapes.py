@@ -27,7 +27,7 @@ from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, name_of
 # What no number measures: other pieces of one surface, a filter between parts that do not meet.
 DISCRETE = 1e-2
 # By how much of its bounding radius a geom may reach beyond others that cover it: a foot that is missing
-# reaches farther. Pieces of a mesh are cut by chance, so that they may by more, if it is little of the robot.
+# reaches farther. Pieces of a mesh are cut by chance: they may by more, if it is little of the robot.
 _STICKS_OUT, _PIECE, _A_LITTLE = 0.1, 0.5, 0.04
 _TERMS = {"collision": "collision geometry", "scenery": "scenery geometry", "dynamics": "fluid geometry"}
 

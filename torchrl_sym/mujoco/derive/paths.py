@@ -44,6 +44,16 @@ def branches(model: MjModel, tendon: int) -> list[Branch]:
     return [branch for branch in found if branch.parts]
 
 
+def links_of_path(model: MjModel, tendon: int) -> list[tuple[int, int]]:
+    """Kinds of the objects on the path of a spatial tendon, and the links that they are on."""
+    welds = weld_ids(model)
+    return [
+        (kind, int(welds[(model.site_bodyid if kind == _SITE else model.geom_bodyid)[number]]))
+        for branch in branches(model, tendon)
+        for kind, number, _ in branch.parts
+    ]
+
+
 def side_sites(model: MjModel) -> set[int]:
     """Sites that say on which side of a geom a tendon passes."""
     wraps = ~np.isin(model.wrap_type, (_SITE, _PULLEY, int(mj.mjtWrap.mjWRAP_JOINT)))

@@ -29,6 +29,8 @@ def weld_ids(model: MjModel) -> NDArray[np.int32]:
         >>> weld_ids(model).tolist()
         [0, 1, 1, 3]
     """
+    if model.nmocap == 0:
+        return model.body_weldid
     root = model.body_rootid  # a mocap body hangs on the world, and is the root of all that hangs on it
     carried = (model.body_weldid == 0) & (model.body_mocapid[root] >= 0)
     return np.where(carried, root, model.body_weldid)
