@@ -62,7 +62,7 @@ def compare_shapes(c: Comparison) -> dict[int, int]:
     if not len(geoms):
         return {}
     if len(lonely):
-        c.unchecked.append(_untouched(model, lonely))
+        c.warnings.append(_untouched(model, lonely))
 
     s, places = _shapes(c, geoms), _places(model, geoms)
     others = np.setdiff1d(np.arange(model.ngeom), geoms)
