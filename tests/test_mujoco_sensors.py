@@ -325,7 +325,10 @@ def test_a_horizontal_magnetic_field_is_mapped_up_to_its_sign(field):
 REFUSED = {
     "user": ('<user name="odd" dim="2" needstage="pos"/>', "'odd' has no .* callback"),
     "camera": ('<camprojection name="odd" site="imu" camera="eye"/>', "'odd' has no .* pixel coordinates"),
-    "contact": ('<contact name="odd" geom1="LF_foot"/>', "'odd' has no .* order of its contacts"),
+    "contact": (
+        '<contact name="odd" subtree1="trunk" data="pos"/>',
+        "'odd' has no .* order of its contacts",
+    ),
     "no image": (
         '<touch name="odd" site="LF"/>',
         "'odd' has no .* under 'reflect-x': no sensor of its kind",
@@ -335,7 +338,10 @@ REFUSED = {
         + "".join(f'<touch name="{n}_t" site="{n}" cutoff="9"/>' for n in ("RF", "LH", "RH")),
         "'odd' has no .* under 'reflect-x': no sensor of its kind, cutoff",
     ),
-    "off the mirror plane": ('<gyro name="odd" site="beside"/>', "'odd' has no .* 'reflect-y': no sensor"),
+    "off the mirror plane": (
+        '<accelerometer name="odd" site="beside"/>',
+        "'odd' has no .* 'reflect-y': no sensor .* the nearest, .*, is [12]00.0 mm away; move it",
+    ),
     "skew axis": ('<framexaxis name="odd" objtype="site" objname="imu"/>', "'odd' has no .* 'reflect-x'"),
     "clipped": ('<gyro name="odd" site="imu" cutoff="9"/>', "'odd' has no .* cutoff clips every entry"),
 }

@@ -41,11 +41,10 @@ def perturb(spec: mujoco.MjSpec, seed: int) -> mujoco.MjSpec:
     for body in spec.bodies[1:]:
         body.mass, body.pos = off(body.mass), off(body.pos, 0.005)
         body.ipos = (np.array(body.ipos) + 1e-3 * rng.standard_normal(3)).tolist()
-        xx, yy, zz, xy, xz, yz = body.fullinertia
-        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        turn = small_rotation(rng)
-        inertia = (1 + 0.01 * rng.standard_normal()) * turn @ inertia @ turn.T
-        body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()
+        turn, turned = np.array([1.0, *(0.005 * rng.standard_normal(3))]), np.zeros(4)
+        mujoco.mju_mulQuat(turned, turn / np.linalg.norm(turn), body.iquat)
+        body.iquat = turned.tolist()
+        body.inertia = (np.array(body.inertia) * (1 + 0.01 * rng.standard_normal())).tolist()
         body.add_site(name=f"{body.name}_imu", pos=1e-3 * rng.standard_normal(3))
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
@@ -64,12 +63,6 @@ def perturb(spec: mujoco.MjSpec, seed: int) -> mujoco.MjSpec:
     return spec
 
 
-def small_rotation(rng: np.random.Generator) -> np.ndarray:
-    out, q = np.zeros(9), np.array([1.0, *(0.005 * rng.standard_normal(3))])
-    mujoco.mju_quat2Mat(out, q / np.linalg.norm(q))
-    return out.reshape(3, 3)
-
-
 def worst_step(compiled, group, seeds=range(6)) -> float:
     robot = derive(compiled, group)
     return max(step_residual(compiled, robot, g, seed)[0] for g in range(group.order) for seed in seeds)
@@ -80,7 +73,7 @@ def worst_step(compiled, group, seeds=range(6)) -> float:
 def test_perturbed_robot_becomes_exact(name, frames, seed):
     spec = perturb(specification(name, frames), seed)
     assert worst_step(spec.compile(), GROUPS[name]) > 1e-3
-    compiled = symmetrize(spec, GROUPS[name]).compile()
+    compiled = symmetrize(spec, GROUPS[name], tolerance=3e-2).compile()
     assert audit(compiled, GROUPS[name]).exact, str(audit(compiled, GROUPS[name]))
     assert worst_step(compiled, GROUPS[name]) <= 1e-9
 
@@ -156,7 +149,7 @@ def test_offsets_frames_welded_bodies_capsules_and_boxes(keyframe):
     assert robot.table("joint", 1)["a"] == "b"
     assert max(step_residual(compiled, robot, 1, seed, steps=5)[0] for seed in range(6)) <= 1e-9
     found = audit(compiled, group, keyframe)
-    assert not found.exact
+    assert "scenery: not a symmetry (1: scenery geometry, reflect-y, lidar" in found.verdict
     assert "left alone: geom 'lidar' has no image" in str(report)
     assert compiled.body_mass.sum() == pytest.approx(spec.compile().body_mass.sum())
     after.delete(after.geom("lidar"))
@@ -185,7 +178,7 @@ def test_free_body_away_from_the_centre_stays_there():
     spec = mujoco.MjSpec.from_string("""<mujoco><worldbody><geom type="plane" size="5 5 1"/>
       <body name="cube" pos="1 2 .1"><freejoint/><geom type="box" size=".1 .1 .1" pos="0 .002 0"/></body>
       </worldbody></mujoco>""")
-    after, report = symmetrize_with_report(spec, K4)
+    after, report = symmetrize_with_report(spec, K4, tolerance=3e-2)
     compiled = after.compile()
     assert compiled.qpos0[:3] == pytest.approx([1, 2, 0.1])
     assert {change.term for change in report.changes} == {"centre of mass", "geom position"}

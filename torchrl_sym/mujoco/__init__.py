@@ -1,8 +1,13 @@
-"""Symmetry of MuJoCo models: derive it, audit it, symmetrize it, verify it, infer that of observations."""
+"""Symmetry of MuJoCo models: find, derive, audit, symmetrize and verify it, infer that of observations."""
+
+from torchrl_sym.extras import require
+
+require("torchrl_sym.mujoco", "mujoco", {"mujoco": "3.11", "scipy": ""})
 
 from torchrl_sym.mujoco.audit import AuditReport, audit
 from torchrl_sym.mujoco.derive import ModelSymmetry, SymmetryError, derive
 from torchrl_sym.mujoco.infer import InferenceError, infer
+from torchrl_sym.mujoco.symmetries import SymmetriesReport, symmetries
 from torchrl_sym.mujoco.symmetrize import SymmetrizeReport, symmetrize, symmetrize_with_report
 from torchrl_sym.mujoco.verify import Remembered, VerifyReport, verify
 
@@ -11,12 +16,14 @@ __all__ = [
     "InferenceError",
     "ModelSymmetry",
     "Remembered",
+    "SymmetriesReport",
     "SymmetrizeReport",
     "SymmetryError",
     "VerifyReport",
     "audit",
     "derive",
     "infer",
+    "symmetries",
     "symmetrize",
     "symmetrize_with_report",
     "verify",

@@ -1,6 +1,9 @@
-"""Images of actuators, which are mapped by their transmission.
+"""Images of actuators, which are mapped by what they drive.
 
-The sign says whether the image pushes the other way.
+The sign says whether the image pushes the other way. A motor whose image nobody drives may be its own
+image, or that of another, through an equality constraint: one finger is driven, a constraint moves the
+other. Motors on slides that an element mixes mix as they do. What cannot be told is refused by actuator: it
+has no image, but everything else has.
 """
 
 from __future__ import annotations
@@ -8,115 +11,60 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
-from torchrl_sym.mujoco.derive.images import Image, SymmetryError
+from torchrl_sym.mujoco.derive.images import Image, SymmetryError, assign, mixture
+from torchrl_sym.mujoco.derive.lengths import Ties
 from torchrl_sym.mujoco.derive.matching import Matcher
-from torchrl_sym.mujoco.model.types import BALL, FREE, Array, MjModel, mj, name_of
+from torchrl_sym.mujoco.derive.transmissions import Transmissions
+from torchrl_sym.mujoco.model.types import Array, MjModel, label_of, mj
 
-_TRANSMISSION = {
-    int(getattr(mj.mjtTrn, f"mjTRN_{name.upper()}")): name
-    for name in ("joint", "jointinparent", "tendon", "site", "body")
-}
+_NONE = 1e9  # cost of a pair that cannot be the image of each other
+_SCALE = 1e-2  # relative: how far a control's scale through constraints may be from 1
+_FILTERS = [int(getattr(mj.mjtDyn, f"mjDYN_{name}")) for name in ("FILTER", "FILTEREXACT")]
+_INTEGRATOR = int(mj.mjtDyn.mjDYN_INTEGRATOR)
 
 
 def map_actuators(
-    matcher: Matcher,
-    map_: CoordinateMap,
-    sites: dict[int, int],
-    tendons: dict[int, Image],
-) -> dict[int, Image]:
-    """Image of every actuator, with the sign and offset of its control.
+    matcher: Matcher, map_: CoordinateMap, tendons: dict[int, Image], tolerance: float
+) -> tuple[dict[int, Image], dict[int, str]]:
+    """Image of every actuator, and why others have none.
 
     Raises:
-        SymmetryError: an actuator's transmission is of an unsupported kind, or no actuator drives the
-            image of what it drives.
+        SymmetryError: no actuator drives the image of what one drives.
     """
     model = matcher.model
+    drives = Transmissions(matcher, map_, tendons, tolerance)
+    count = getattr(model, "nactuator", model.nu)
+    if np.array_equal(matcher.matrix, np.eye(3)):
+        return {a: Image(a) for a in range(count)}, {}
+    refusals = {a: reason for a in range(count) if (reason := drives.unsupported(a))}
+    known = [a for a in range(count) if a not in refusals]
+    fits = drives.fits(known)
+    cost = np.full((len(known), len(known)), _NONE)
+    for (a, b), fit in fits.items():
+        cost[known.index(a), known.index(b)] = (
+            _gain_distance(model, a, b) + 10 * fit.misfit + 1e-6 * (a != b)
+        )
     images: dict[int, Image] = {}
-    for a in range(model.nu):
-        fits = []
-        for b in range(model.nu):
-            sign = _transmission_sign(matcher, map_, sites, tendons, a, b)
-            if sign is not None:
-                fits.append((_gain_distance(model, a, b), b != a, b, sign))
-        free = [fit for fit in sorted(fits) if fit[2] not in {image.index for image in images.values()}]
-        if not free:
+    for row, column in assign(cost):
+        if cost[row, column] < _NONE:
+            a, b = known[row], known[column]
+            images[a] = Image(b, fits[a, b].sign, misfit=fits[a, b].misfit)
+            _add_offset(drives, images[a], a, drives.shift(b))
+
+    rest = [a for a in known if a not in images]
+    taken = {image.index for image in images.values()}
+    ties = Ties.of(model) if rest else None
+    for a in rest:
+        free = [b for b in known if b not in taken]
+        image = _mixed(drives, a) or (ties and _tied(drives, ties, a, free))
+        if not image:
             raise SymmetryError(
-                f"{name_of(model, 'actuator', a)} has no image: no actuator drives the image of what it "
+                f"{label_of(model, 'actuator', a)} has no image: no actuator drives the image of what it "
                 "drives; add the missing actuator, or use a smaller group"
             )
-        b, sign = free[0][2], free[0][3]
-        images[a] = Image(b, sign, _control_offset(model, map_, a, b))
-    return images
-
-
-def _transmission_sign(
-    matcher: Matcher,
-    map_: CoordinateMap,
-    sites: dict[int, int],
-    tendons: dict[int, Image],
-    a: int,
-    b: int,
-) -> float | None:
-    """Sign between actuator a's image and actuator b, None if b does not drive a's image."""
-    model = matcher.model
-    kind = _TRANSMISSION.get(int(model.actuator_trntype[a]))
-    if kind is None:
-        raise SymmetryError(
-            f"{name_of(model, 'actuator', a)} has a transmission of an unsupported kind; supported are "
-            f"{sorted(set(_TRANSMISSION.values()))}"
-        )
-    has_reference = kind == "site" and int(model.actuator_trnid[a, 1]) >= 0
-    in_parent = kind == "jointinparent" and _dofs(model, int(model.actuator_trnid[a, 0])) > 1
-    if has_reference or in_parent:
-        raise SymmetryError(
-            f"{name_of(model, 'actuator', a)} acts in another frame (reference site, or parent of a ball "
-            "or free joint), which is not supported; use a joint or a plain site transmission"
-        )
-    if int(model.actuator_trntype[b]) != int(model.actuator_trntype[a]):
-        return None
-    target, other = int(model.actuator_trnid[a, 0]), int(model.actuator_trnid[b, 0])
-    gear, gear_other = model.actuator_gear[a], model.actuator_gear[b]
-    if kind == "tendon":
-        tendon = tendons[target]
-        scalar = tendon.sign * np.sign(gear[0] * gear_other[0])
-        return float(scalar) if tendon.index == other else None
-    if kind == "body":
-        return (
-            1.0
-            if map_.bodies.get(int(model.body_weldid[target])) == int(model.body_weldid[other])
-            else None
-        )
-    if kind == "site":
-        if sites.get(target) != other:
-            return None
-        frame = _site_frame(matcher, target, other)
-        torque = round(float(np.linalg.det(frame))) * frame @ gear[3:]
-        return _parallel(np.concatenate([frame @ gear[:3], torque]), gear_other)
-    if map_.joints.get(target) != other:
-        return None
-    if target in map_.signs:
-        return float(map_.signs[target] * np.sign(gear[0] * gear_other[0]))
-    rows = slice(int(model.jnt_dofadr[target]), int(model.jnt_dofadr[target]) + _dofs(model, target))
-    columns = slice(int(model.jnt_dofadr[other]), int(model.jnt_dofadr[other]) + _dofs(model, target))
-    size = _dofs(model, target)
-    return _parallel(map_.qvel[columns, rows] @ gear[:size], gear_other[:size])
-
-
-def _dofs(model: MjModel, joint: int) -> int:
-    return {FREE: 6, BALL: 3}.get(int(model.jnt_type[joint]), 1)
-
-
-def _site_frame(matcher: Matcher, a: int, b: int) -> Array:
-    """V of a site: how a polar vector in the frame of site a becomes one in the frame of its image b."""
-    one, other = matcher.data.site_xmat[a].reshape(3, 3), matcher.image.site_xmat[b].reshape(3, 3)
-    return other.T @ matcher.matrix @ one
-
-
-def _parallel(image: Array, target: Array) -> float | None:
-    for sign in (1.0, -1.0):
-        if np.allclose(image, sign * target, atol=1e-6 * max(1.0, float(np.abs(target).max()))):
-            return sign
-    return None
+        images[a] = image
+        taken.add(image.index)
+    return dict(sorted(images.items())), refusals
 
 
 def _gain_distance(model: MjModel, a: int, b: int) -> float:
@@ -124,15 +72,72 @@ def _gain_distance(model: MjModel, a: int, b: int) -> float:
     kinds = ("actuator_dyntype", "actuator_gaintype", "actuator_biastype")
     distance = sum(1e3 for field in kinds if int(getattr(model, field)[a]) != int(getattr(model, field)[b]))
     for field in ("actuator_gainprm", "actuator_biasprm"):
-        distance += float(np.abs(getattr(model, field)[a] - getattr(model, field)[b]).sum())
+        one, other = (getattr(model, field)[x] for x in (a, b))
+        scale = np.maximum(np.abs(one), np.abs(other))
+        distance += float((np.abs(one - other) / np.where(scale > 0, scale, 1.0)).sum())
     return distance
 
 
-def _control_offset(model: MjModel, map_: CoordinateMap, a: int, b: int) -> float:
-    """Offset of the control of a position servo on a joint whose coordinate has an offset."""
-    is_joint = _TRANSMISSION.get(int(model.actuator_trntype[a])) in ("joint", "jointinparent")
-    target = int(model.actuator_trnid[a, 0])
-    servo = model.actuator_biasprm[a, 1] != 0
-    if not (is_joint and servo and target in map_.offsets):
-        return 0.0
-    return float(model.actuator_gear[b, 0]) * map_.offsets[target]
+def _add_offset(drives: Transmissions, image: Image, a: int, shift: float) -> None:
+    """What is added to the length, and to control and state of a servo, which are lengths."""
+    image.length_offset = shift
+    if drives.is_servo(a):
+        dynamics = int(drives.model.actuator_dyntype[a])
+        image.offset = 0.0 if dynamics == _INTEGRATOR else shift
+        image.state_offset = shift if dynamics in (*_FILTERS, _INTEGRATOR) else 0.0
+
+
+def _mixed(drives: Transmissions, a: int) -> Image | None:
+    """Image of a motor on slides that an element mixes, among motors of its kind on each of them."""
+    model, mine = drives.model, drives.length(a)
+    if mine is None or not drives.map.mixed:
+        return None
+    target = drives.matrix @ mine
+    parts: dict[int, Array] = {}
+    fields = ("trntype", "dyntype", "gaintype", "biastype")
+    candidates = sorted(
+        range(len(model.actuator_trntype)), key=lambda b: (_gain_distance(model, a, b), b != a, b)
+    )
+    for b in candidates:
+        length = None if drives.unsupported(b) else drives.length(b)
+        alike = all(
+            getattr(model, f"actuator_{f}")[a] == getattr(model, f"actuator_{f}")[b] for f in fields
+        )
+        if length is None or not alike or not length.any():
+            continue
+        rank = np.linalg.matrix_rank(np.stack([*parts.values(), length]), tol=1e-9)
+        if rank > len(parts) and np.abs(length @ target) > 1e-9:
+            parts[b] = length
+    weights = mixture(target, parts)
+    if not weights:
+        return None
+    image = Image(max(weights, key=lambda b: abs(weights[b])), mixture=weights)
+    sizes = [float(np.linalg.norm(parts[b])) for b in weights] + [float(np.linalg.norm(mine))]
+    image.misfit = max(sizes) / min(sizes) - 1
+    _add_offset(drives, image, a, drives.shift(image.index))
+    return image
+
+
+def _tied(drives: Transmissions, ties: Ties, a: int, free: list[int]) -> Image | None:
+    """Image of an actuator through equality constraints: an actuator that moves what its image would."""
+    model, mine = drives.model, drives.length(a)
+    if mine is None:
+        return None
+    target = drives.matrix @ mine
+    found: list[tuple[float, bool, int, Image]] = []
+    for b in free:
+        theirs = drives.length(b)
+        if theirs is None:
+            continue
+        wanted, actual = ties.project(target), ties.project(theirs)
+        sizes = np.linalg.norm(wanted), np.linalg.norm(actual)
+        if min(sizes) < 1e-9 or abs(sizes[0] / sizes[1] - 1) > _SCALE:
+            continue
+        for sign in (1.0, -1.0):
+            k = ties.combine(target - sign * sizes[0] / sizes[1] * theirs)
+            if k is not None:
+                image = Image(b, sign, through=ties.words(model, k))
+                image.misfit = abs(float(sizes[0] / sizes[1]) - 1)
+                _add_offset(drives, image, a, sign * float(target @ drives.offset - k @ ties.values))
+                found.append((_gain_distance(model, a, b), b != a, b, image))
+    return min(found, key=lambda f: f[:3])[3] if found else None

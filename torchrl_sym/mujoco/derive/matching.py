@@ -1,133 +1,91 @@
-"""How a symmetry moves rigid links onto each other.
+"""How one element of a group moves rigid links and joints onto each other, at the pose that was found.
 
-Matching at a single pose is enough: a kinematic tree is determined by its reference configuration and its
-joint axes (the product of exponentials), so if masses, anchors and axes are mapped onto each other at one
-pose that the symmetry keeps, the equations of motion are mapped onto each other everywhere.
+All places are relative to the axis that the group acts about, and trees that nothing holds stand on it, so
+that an element sends a point x to R x, whatever part it belongs to.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from torchrl_sym.mujoco.model.links import Link
-from torchrl_sym.mujoco.model.types import BALL, FREE, SLIDE, Array, MjData, MjModel, mj
-
-_MISFIT = 1e3  # cost of a pair that cannot be the image of each other; far above any distance
+from torchrl_sym.mujoco.derive.chains import JointPairs
+from torchrl_sym.mujoco.derive.pairing import Misfit, Pairing
+from torchrl_sym.mujoco.derive.parts import Parts
+from torchrl_sym.mujoco.model.poses import shift
+from torchrl_sym.mujoco.model.releases import weld_ids
+from torchrl_sym.mujoco.model.types import Array, MjData, mj
 
 
 class Matcher:
-    """Finds the image of every link and joint under one isometry.
+    """Image of every link and joint under one isometry.
 
     Args:
-        model: the compiled model.
-        data: kinematics at the reference pose.
-        links: from :func:`links_of`.
-        matrix: the isometry R, ``(3, 3)``; it acts about the origin of the world.
+        parts: the model at the pose that the group keeps, its loose trees on the axis.
+        matrix: the isometry R, ``(3, 3)``.
         lift: quaternion of R, or of -R for a reflection.
-        carried: bodies that are only carried along, so that their frames turn with the world.
+        axis: a point (world) of the axis; R acts on the world as x -> R x + (I - R) axis.
+        loose: images of the trees that nothing holds.
 
     Attributes:
+        data: kinematics at the reference pose, places relative to the axis.
+        extent: size of the largest tree of moving links, which lengths are made relative to.
         image: kinematics where images are looked for: the reference pose, carried bodies turned by R.
+        links: from :func:`~torchrl_sym.mujoco.model.links.links_of`.
+        carried: bodies that are only carried along, so that their frames turn with the world.
+        shift: (I - R) axis, what R adds to a point of the world.
+        images: image of every link, as a map of body numbers.
     """
 
     def __init__(
-        self,
-        model: MjModel,
-        data: MjData,
-        links: dict[int, Link],
-        matrix: Array,
-        lift: Array,
-        carried: frozenset[int] = frozenset(),
+        self, parts: Parts, matrix: Array, lift: Array, axis: Array, loose: dict[int, int]
     ) -> None:
-        self.model, self.data, self.links = model, data, links
-        self.matrix, self.lift, self.carried = matrix, lift, carried
-        self.image = self._carry() if carried else data
+        self.model, self.data, self.links, self.carried = (
+            parts.model,
+            parts.data,
+            parts.links,
+            parts.carried,
+        )
+        self.matrix, self.lift, self.axis = matrix, lift, axis
         self.det = round(float(np.linalg.det(matrix)))
-        self.extent = max(float(model.stat.extent), 1e-6)
-        self.total_mass = max(sum(link.mass for link in links.values()), 1e-12)
-        self.total_inertia = max(max(np.trace(link.inertia) for link in links.values()), 1e-12)
-        self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}
+        self.shift = axis - matrix @ axis
+        self.extent = parts.extent
+        self.image = self._carry() if self.carried else self.data
+        self.pairing = Pairing(parts, matrix)
+        self.images = self.pairing.images(0, 0, loose | {b: b for b in self.carried})
 
     def _carry(self) -> MjData:
         model, data, image = self.model, self.data, mj.MjData(self.model)
         image.qpos[:], image.mocap_pos[:], image.mocap_quat[:] = data.qpos, data.mocap_pos, data.mocap_quat
         for body in self.carried:
-            turned = np.zeros(4)
+            turned, place = np.zeros(4), self.matrix @ data.xpos[body] + self.axis
             mj.mju_mulQuat(turned, self.lift, data.xquat[body])
             mocap = int(model.body_mocapid[body])
             if mocap >= 0:
-                image.mocap_pos[mocap], image.mocap_quat[mocap] = self.matrix @ data.xpos[body], turned
+                image.mocap_pos[mocap], image.mocap_quat[mocap] = place, turned
             else:
                 start = int(model.jnt_qposadr[model.body_jntadr[body]])
-                image.qpos[start : start + 3] = self.matrix @ data.xpos[body]
+                image.qpos[start : start + 3] = place
                 image.qpos[start + 3 : start + 7] = turned
         mj.mj_kinematics(model, image)
         mj.mj_comPos(model, image)
+        shift(image, -self.axis)
         return image
 
-    def links_to(self) -> dict[int, int]:
-        """Image of every link, as a map of body numbers."""
-        images: dict[int, int] = {}
-        stack = [(0, 0)]
-        while stack:
-            a, b = stack.pop()
-            images[a] = b
-            stack += self._pair(a, b)[1]
-        return images
+    def size(self, body: int) -> float:
+        """Size of the tree of moving links that a body is in: an object's own beside a robot."""
+        return self.pairing.parts.size(int(weld_ids(self.model)[body]))
 
-    def joints_to(self, a: int, b: int) -> dict[int, int]:
-        """Image among the joints of link b of every joint of link a; empty if their numbers differ."""
-        mine, theirs = self.links[a].joints, self.links[b].joints
-        if len(mine) != len(theirs) or not mine:
-            return {}
-        cost = np.array([[self.joint_cost(i, j) for j in theirs] for i in mine])
-        rows, columns = linear_sum_assignment(cost)
-        return {mine[r]: theirs[c] for r, c in zip(rows, columns, strict=True)}
+    def misfit(self, tolerance: float) -> Misfit:
+        """The worst pair of links or joints; above 1 this is no symmetry."""
+        missing = [b for b in self.links[0].children if b not in self.images]
+        if missing:
+            return Misfit(np.inf, "missing", missing[0])
+        return self.pairing.worst(self.images, tolerance)
 
-    def joint_cost(self, i: int, j: int) -> float:
-        """How far joint i's image is from joint j: type, axis up to sign, and anchor."""
-        model, data = self.model, self.data
-        kind = int(model.jnt_type[i])
-        if kind != int(model.jnt_type[j]):
-            return _MISFIT
-        if kind == FREE:
-            return 0.0
-        offset = self.matrix @ data.xanchor[i] - data.xanchor[j]
-        if kind == BALL:
-            return float(np.linalg.norm(offset)) / self.extent
-        axis = data.xaxis[j]
-        misaligned = 1 - abs(float(self.matrix @ data.xaxis[i] @ axis))
-        if kind == SLIDE:
-            return misaligned  # a slide's anchor does not matter
-        offset -= (offset @ axis) * axis  # a hinge's anchor may be anywhere on its axis
-        return misaligned + float(np.linalg.norm(offset)) / self.extent
+    def joints(self) -> dict[int, int]:
+        """Image of every joint, if every link has one."""
+        return {i: j for joints in self.joint_pairs().values() for i, j in joints.images.items()}
 
-    def _pair(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
-        if (a, b) not in self._pairs:  # not functools.cache, which does not pickle
-            self._pairs[a, b] = self._pair_of_links(a, b)
-        return self._pairs[a, b]
-
-    def _pair_of_links(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
-        """Cost of mapping subtree a onto subtree b, and the best pairs of children."""
-        one, other = self.links[a], self.links[b]
-        cost = float(np.linalg.norm(self.matrix @ one.com - other.com)) / self.extent
-        cost += abs(one.mass - other.mass) / self.total_mass
-        image = self.matrix @ one.inertia @ self.matrix.T
-        cost += float(np.abs(image - other.inertia).max()) / self.total_inertia
-        cost += 1e-9 * (a != b)  # links at one place stay where they are
-        is_mocap = self.model.body_mocapid[[a, b]] >= 0
-        cost += _MISFIT * bool(is_mocap[0] != is_mocap[1])
-        joints = self.joints_to(a, b)
-        if len(joints) != len(one.joints) or len(one.joints) != len(other.joints):
-            cost += _MISFIT
-        cost += sum(self.joint_cost(i, j) for i, j in joints.items())
-        own = [(c, c) for c in one.children if c in self.carried and a == b]
-        mine, theirs = ([c for c in link.children if c not in self.carried] for link in (one, other))
-        if not mine or not theirs:
-            return cost + _MISFIT * (len(mine) != len(theirs)), own
-        table = np.array([[self._pair(c, d)[0] for d in theirs] for c in mine])
-        rows, columns = linear_sum_assignment(table)
-        cost += float(table[rows, columns].sum())
-        cost += _MISFIT * abs(len(mine) - len(theirs))
-        return cost, own + [(mine[r], theirs[c]) for r, c in zip(rows, columns, strict=True)]
+    def joint_pairs(self) -> dict[int, JointPairs]:
+        """Images of the joints of every link."""
+        return {a: self.pairing.joint_pairs(a, b) for a, b in self.images.items()}

@@ -12,19 +12,19 @@ from __future__ import annotations
 
 from torchrl_sym.mujoco.model.types import mj
 
-_TYPES = {int(value): name.removeprefix("mjSENS_") for name, value in mj.mjtSensor.__members__.items()}
-_OBJECTS = {int(value): name.removeprefix("mjOBJ_") for name, value in mj.mjtObj.__members__.items()}
+TYPES = {int(value): name.removeprefix("mjSENS_") for name, value in mj.mjtSensor.__members__.items()}
+OBJECTS = {int(value): name.removeprefix("mjOBJ_") for name, value in mj.mjtObj.__members__.items()}
 
 
 # What an image must have in common with a sensor, how the reading transforms, and the types it is true of.
-_RULES = {
+RULES = {
     kind: (where, measures)
     for where, measures, kinds in (
         ("place", "polar", "ACCELEROMETER VELOCIMETER"),
-        ("place", "axial", "GYRO"),
-        ("body place", "polar", "FORCE"),
+        ("link", "axial", "GYRO"),
+        ("body link", "polar", "FORCE"),
         ("body place", "axial", "TORQUE"),
-        ("body place", "scalar", "TOUCH"),
+        ("body volume", "scalar", "TOUCH"),
         ("body place", "ray", "RANGEFINDER"),
         ("link", "magnetic", "MAGNETOMETER"),
         ("place", "scalar", "INSIDESITE"),
@@ -40,21 +40,21 @@ _RULES = {
         ("link", "quaternion", "FRAMEQUAT"),
         ("body", "world polar", "SUBTREECOM SUBTREELINVEL"),
         ("body", "world axial", "SUBTREEANGMOM"),
+        ("contact", "contact", "CONTACT"),
         ("pair", "pair", "GEOMDIST GEOMNORMAL GEOMFROMTO"),
         ("model", "scalar", "CLOCK E_POTENTIAL E_KINETIC"),
     )
     for kind in kinds.split()
 }
-_UNSUPPORTED = {
+UNSUPPORTED = {
     "USER": "its reading comes from a callback, which cannot be looked into",
     "PLUGIN": "its reading comes from a plugin, which cannot be looked into",
     "CAMPROJECTION": "pixel coordinates are not linear in the image's ones",
-    "CONTACT": "the order of its contacts is the solver's, not the geometry's",
     "TACTILE": "the vertices of its mesh are not matched",
 }
-_AXES = ("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
-_RAY_FIELDS = (1, 3, 3, 3, 3, 1)  # dist; dir, origin, point, normal in the world frame; depth
-_POSES = {
+AXES = ("FRAMEXAXIS", "FRAMEYAXIS", "FRAMEZAXIS")
+RAY_FIELDS = (1, 3, 3, 3, 3, 1)  # dist; dir, origin, point, normal in the world frame; depth
+POSES = {
     "XBODY": ("xpos", "xmat"),
     "BODY": ("xipos", "ximat"),
     "GEOM": ("geom_xpos", "geom_xmat"),

@@ -1,68 +1,99 @@
 """Images of tendons, which are mapped by what they couple.
 
-A fixed tendon is mapped by its joint coefficients (up to a common sign), a spatial one by its path (in
-either direction).
+A fixed tendon is mapped by its joint coefficients, up to a common sign; those of slides that an element
+mixes mix. A spatial one is mapped by its path: branches, each in either direction, of sites and of the
+spheres and cylinders that it wraps around, on the side that the side site says.
 """
 
 from __future__ import annotations
 
+import numpy as np
+
 from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
-from torchrl_sym.mujoco.derive.images import Image, SymmetryError
-from torchrl_sym.mujoco.model.types import MjModel, mj, name_of
+from torchrl_sym.mujoco.derive.images import Image, SymmetryError, assign, mixture
+from torchrl_sym.mujoco.derive.lengths import coordinate_offsets, is_fixed, tendon_length
+from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.derive.paths import links_of_path, path_gap, path_words
+from torchrl_sym.mujoco.model.types import Array, MjModel, label_of
 
-_WRAP = mj.mjtWrap
+_COEFFICIENTS = 0.3  # relative: tendons that couple the same joints nearly alike; the audit says how nearly
+_PLACES = 10.0  # tolerances that a path may be off, as for centres of mass
+_MISFIT = 1e3  # cost of a pair that cannot be the image of each other
 
 
-def map_tendons(model: MjModel, map_: CoordinateMap, sites: dict[int, int]) -> dict[int, Image]:
-    """Image of every tendon, with the sign of its length.
+def map_tendons(matcher: Matcher, map_: CoordinateMap, tolerance: float) -> dict[int, Image]:
+    """Image of every tendon, with the sign of its length and how far off it is.
 
     Raises:
         SymmetryError: a tendon couples joints or sites whose images no tendon couples.
     """
-    contents = [_tendon(model, t) for t in range(model.ntendon)]
+    model, count = matcher.model, matcher.model.ntendon
+    if np.array_equal(matcher.matrix, np.eye(3)):
+        return {t: Image(t) for t in range(count)}
+    lengths = [tendon_length(model, t)[: model.nv] for t in range(count)]
+    signs, cost = np.ones((count, count)), np.full((count, count), _MISFIT)
+    alike: dict[tuple, list[int]] = {}
+    for u in range(count):
+        alike.setdefault(_couples(model, u, lengths[u], {}), []).append(u)
+    for t in range(count):
+        moved = map_.qvel @ lengths[t]
+        for u in alike.get(_couples(model, t, moved, matcher.images), ()):
+            if is_fixed(model, t):
+                gap, signs[t, u] = _coefficient_gap(moved, lengths[u])
+                fits = gap <= _COEFFICIENTS
+            else:
+                gap = path_gap(matcher, t, u)
+                fits = gap <= _PLACES * tolerance
+            if fits:
+                cost[t, u] = gap + 1e-7 * (t != u)  # tendons that are alike stay where they are
+
     images = {}
-    for t, (kind, parts) in enumerate(contents):
-        if kind == "fixed":
-            moved = {map_.joints[j]: map_.signs[j] * c for j, c in parts}
-            candidates = [(dict(other), s) for _, other in contents for s in (1.0, -1.0)]
-            hits = [
-                Image(i // 2, sign)
-                for i, (other, sign) in enumerate(candidates)
-                if contents[i // 2][0] == "fixed"
-                and other.keys() == moved.keys()
-                and all(abs(moved[j] - sign * other[j]) < 1e-6 for j in moved)
-            ]
+    for t, u in assign(cost):
+        if cost[t, u] < _MISFIT:
+            images[t] = Image(u, float(signs[t, u]), misfit=max(cost[t, u] - 1e-7 * (t != u), 0.0))
         else:
-            path = [(w, sites.get(o) if w == "site" else None) for w, o in parts]
-            hits = [
-                Image(i)
-                for i, (other_kind, other) in enumerate(contents)
-                if other_kind == "spatial" and _same_path(path, other)
-            ]
-        if not hits:
-            raise SymmetryError(
-                f"{name_of(model, 'tendon', t)} has no image: no tendon couples the images of what it "
-                "couples; add the missing tendon, or use a smaller group"
-            )
-        images[t] = next((hit for hit in hits if hit.index == t), hits[0])
+            images[t] = _mixed(matcher, map_, lengths, t)
+    shifts = coordinate_offsets(model, map_)
+    for image in images.values():
+        image.offset = float(lengths[image.index] @ shifts)
     return images
 
 
-def _tendon(model: MjModel, t: int) -> tuple[str, list[tuple]]:
-    start, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
-    kinds, objects = model.wrap_type[start : start + count], model.wrap_objid[start : start + count]
-    if kinds[0] == int(_WRAP.mjWRAP_JOINT):
-        coefficients = model.wrap_prm[start : start + count]
-        return "fixed", [(int(j), float(c)) for j, c in zip(objects, coefficients, strict=True)]
-    names = {int(_WRAP.mjWRAP_SITE): "site", int(_WRAP.mjWRAP_PULLEY): "pulley"}
-    return "spatial", [(names.get(int(k), "geom"), int(o)) for k, o in zip(kinds, objects, strict=True)]
+def _couples(model: MjModel, tendon: int, length: Array, images: dict[int, int]) -> tuple:
+    """What a tendon and its image have in common: which dofs it couples, or the links that it runs over."""
+    if is_fixed(model, tendon):
+        return ("fixed", *np.flatnonzero(np.abs(length) > 1e-9).tolist())
+    return (
+        "spatial",
+        *sorted((kind, images.get(link, link)) for kind, link in links_of_path(model, tendon)),
+    )
 
 
-def _same_path(path: list[tuple], other: list[tuple]) -> bool:
-    def equal(a: list[tuple], b: list[tuple]) -> bool:
-        # wrapping geoms are compared by their place in the path only; the audit compares their shapes
-        return len(a) == len(b) and all(
-            x[0] == y[0] and (x[0] != "site" or x[1] == y[1]) for x, y in zip(a, b, strict=True)
+def _coefficient_gap(moved: Array, other: Array) -> tuple[float, float]:
+    """Relative distance of two sets of coefficients, and the sign with which it is least."""
+    if ((np.abs(moved) > 1e-9) != (np.abs(other) > 1e-9)).any():
+        return np.inf, 1.0
+    size = max(float(np.linalg.norm(other)), 1e-12)
+    gaps = [(float(np.linalg.norm(moved - sign * other)) / size, -sign) for sign in (1.0, -1.0)]
+    gap, minus = min(gaps)
+    return gap, -minus
+
+
+def _mixed(matcher: Matcher, map_: CoordinateMap, lengths: list[Array], t: int) -> Image:
+    """Image of a tendon of slides that mix."""
+    model = matcher.model
+    name = label_of(model, "tendon", t)
+    if not is_fixed(model, t):
+        words = path_words(matcher, t)
+        raise SymmetryError(
+            f"{name} has no image: no tendon takes the image of its path; {words}"
+            "add the missing tendon, or use a smaller group"
         )
-
-    return equal(path, other) or equal(path[::-1], other)
+    parts = {u: v for u, v in enumerate(lengths) if is_fixed(model, u) and np.linalg.norm(v) > 0}
+    weights = mixture(map_.qvel @ lengths[t], parts) if map_.mixed else {}
+    if not weights:
+        raise SymmetryError(
+            f"{name} has no image: no tendon couples the images of what it couples; add the missing "
+            "tendon, or use a smaller group"
+        )
+    return Image(max(weights, key=lambda u: abs(weights[u])), mixture=weights)

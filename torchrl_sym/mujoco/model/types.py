@@ -32,6 +32,18 @@ def name_of(model: MjModel, kind: str, index: int) -> str:
     return getattr(model, kind)(index).name or f"{kind} {index}"
 
 
+def label_of(model: MjModel, kind: str, index: int) -> str:
+    """Name of an element, for messages; one without a name is said where it is."""
+    element = getattr(model, kind)(index)
+    if element.name:
+        return element.name
+    owners = {"body": "body_parentid", "joint": "jnt_bodyid", "geom": "geom_bodyid", "site": "site_bodyid"}
+    if kind not in owners or (kind == "body" and index == 0):
+        return f"{kind} {index}"
+    owner = int(getattr(model, owners[kind])[index])
+    return f"{kind} {index} in {name_of(model, 'body', owner)!r}"
+
+
 @functools.cache
 def _numbers() -> list[str]:
     """Names of a model's arrays of real numbers."""
@@ -65,3 +77,8 @@ def check_mocap(model: MjModel, position: Any, rotation: Any) -> None:
             raise ValueError(
                 f"{name}: expected a tensor (..., {model.nmocap}, {size}), got {checks.shown(x)}"
             )
+
+
+def dofs_of(model: MjModel, joint: int) -> int:
+    """Number of degrees of freedom of a joint."""
+    return {FREE: 6, BALL: 3}.get(int(model.jnt_type[joint]), 1)

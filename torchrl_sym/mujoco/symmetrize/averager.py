@@ -1,7 +1,8 @@
 """Orbit averages of what a model says of its parts, written back into its specification.
 
-Everything is averaged in world axes at the reference pose and written back into the body frames. The
-frames keep their rotation; a body's origin follows its first hinge or ball joint.
+Everything is averaged in world axes at the reference pose, about the axis of the group, and written back
+into the body frames. The frames keep their rotation; a body's origin follows its first hinge or ball joint.
+Free and mocap bodies stay where they stand, which is a state.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ import numpy as np
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.derive import derive
-from torchrl_sym.mujoco.model.links import links_of
-from torchrl_sym.mujoco.model.poses import reference_pose
+from torchrl_sym.mujoco.derive.images import SymmetryError
+from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import quaternion, rotation
-from torchrl_sym.mujoco.model.types import Array, mj, name_of
+from torchrl_sym.mujoco.model.types import Array, label_of, mj, name_of
 from torchrl_sym.mujoco.symmetrize.report import Change, SymmetrizeReport
 
 MjSpec: TypeAlias = Any
@@ -35,30 +37,41 @@ class Averager:
         keyframe: int | str | None,
         tolerance: float,
         carried: Sequence[str],
+        axis: tuple[float, float] | None,
     ) -> None:
         remedy = "a specification is what is changed: MjSpec.from_file(path)"
         self.spec = checks.instance("spec", spec, mj.MjSpec, remedy).copy()
         self.spec.compiler.fusestatic = False  # fused bodies have no specification to write to
         self.model = self.spec.compile()
-        self.tolerance, self.keyframe, self.group = tolerance, keyframe, group
-        symmetry = derive(self.model, group, keyframe, tolerance=tolerance, carried=carried)
+        self.tolerance, self.group = tolerance, group
+        symmetry = derive(self.model, group, keyframe, tolerance=tolerance, carried=carried, axis=axis)
         self.actions = symmetry.actions
         self.carried = self.actions[0].matcher.carried
         self.turns = group.matrices.numpy()
-        self.data = reference_pose(self.model, keyframe)
-        self.links = links_of(self.model, self.data)
+        for body, gap in (item for action in self.actions for item in action.coordinates.astray.items()):
+            name = label_of(self.model, "body", body)
+            raise SymmetryError(
+                f"the frame of {name} is {500 * gap:.3g} mm beside where the body is symmetric, and frames "
+                "are not moved; set the body's pos onto the plane or axis of symmetry"
+            )
+        matcher = self.actions[0].matcher
+        self.data, self.links = matcher.data, matcher.links
         self.bodies: Maps = [
             {a: b for a, b in action.coordinates.bodies.items() if a not in self.carried}
             for action in self.actions
         ]
         self.rotation = self.data.xmat.reshape(-1, 3, 3)
-        self.extent = max(float(self.model.stat.extent), 1e-6)
+        self.extent = matcher.extent
         names = sorted(name_of(self.model, "body", b) for b in self.carried)
-        # of every link: the point that its tree is averaged about, how far the tree is moved, and the link
-        self.origin = {b: np.zeros(3) for b in self.links}
-        self.shift = {b: np.zeros(3) for b in self.links}
-        self.moved = dict(self.shift)
+        # of every link: the point that its tree is averaged about, and how far its frame is moved
+        self.origin = {b: self._origin(b) for b in self.links}
+        self.moved = {b: np.zeros(3) for b in self.links}
         self.report = SymmetrizeReport(left=[f"body {name!r} is only carried along" for name in names])
+
+    def _origin(self, link: int) -> Array:
+        """Loose trees are averaged about their frame, wherever that is; others about the axis."""
+        tree = self.links[link].tree
+        return self.data.xpos[tree].copy() if tree and is_loose(self.model, tree) else np.zeros(3)
 
     def mean(self, maps: Maps, value: Callable[[int, int], Any]) -> dict[int, Array]:
         """Orbit averages of value(g, a), the image under g of element a's quantity."""
@@ -71,7 +84,7 @@ class Averager:
     def closed(self, maps: Maps, kind: str) -> Maps:
         """The part of the maps on which the group acts; what has no image is noted in the report."""
         table = self.group.table
-        owner = self.model.body_weldid[getattr(self.model, f"{kind}_bodyid")]
+        owner = weld_ids(self.model)[getattr(self.model, f"{kind}_bodyid")]
         own = {a for a, body in enumerate(owner) if int(body) in self.carried}
         everything = set().union(*maps) - own
         good = {
@@ -92,7 +105,7 @@ class Averager:
     def points(self, maps: Maps, points: Array, owner: Callable[[int], int]) -> dict[int, Array]:
         """Averages of world points, taken relative to the origin of the tree that they belong to."""
         means = self.mean(maps, lambda g, a: self.turns[g] @ (points[a] - self.origin[owner(a)]))
-        return {b: mean + self.origin[owner(b)] + self.shift[owner(b)] for b, mean in means.items()}
+        return {b: mean + self.origin[owner(b)] for b, mean in means.items()}
 
     def write(
         self, element: Any, attribute: str, new: Any, old: Any, term: str, name: str, scale: float = 0.0
@@ -135,7 +148,7 @@ class Averager:
 
     def in_body(self, body: int, place: Array) -> Array:
         """A world position in the frame of a body, where that ends up."""
-        origin = self.data.xpos[body] + self.moved[int(self.model.body_weldid[body])]
+        origin = self.data.xpos[body] + self.moved[int(weld_ids(self.model)[body])]
         return self.rotation[body].T @ (place - origin)
 
 

@@ -1,4 +1,4 @@
-"""Averages of where trees, bodies and joints are.
+"""Averages of where bodies and joints are.
 
 An anchor moves across its hinge's axis only, as its place along it is free.
 """
@@ -7,28 +7,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
-from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, mj, name_of
+from torchrl_sym.mujoco.model.types import BALL, HINGE, SLIDE, mj, name_of
 from torchrl_sym.mujoco.symmetrize.averager import Averager, frame_of
-
-
-def place_trees(averager: Averager) -> None:
-    """Free and mocap bodies carry a tree: centre it if it is nearly centred, else leave it in place."""
-    model, data = averager.model, averager.data
-    means = averager.mean(averager.bodies, lambda g, a: averager.turns[g] @ data.xpos[a])
-    for b, link in averager.links.items():
-        free = bool(link.joints) and int(model.jnt_type[link.joints[0]]) == FREE
-        mocap = model.body_mocapid[b] >= 0
-        if free or mocap:
-            averager.origin[b] = data.xpos[b].copy()
-            moved = means.get(b, data.xpos[b]) - data.xpos[b]
-            if np.linalg.norm(moved) <= averager.tolerance * averager.extent and averager.keyframe is None:
-                averager.shift[b] = moved
-        elif b:
-            averager.origin[b], averager.shift[b] = (
-                averager.origin[link.parent],
-                averager.shift[link.parent],
-            )
 
 
 def place_joints(averager: Averager) -> None:
@@ -43,15 +26,14 @@ def place_joints(averager: Averager) -> None:
         total = sum(axis * np.sign(axis @ data.xaxis[b]) for axis in turned)
         axes[b] = total / np.linalg.norm(total)
         if int(model.jnt_type[b]) == HINGE:
-            along = axes[b] @ (anchors[b] - data.xanchor[b] - averager.shift[owner[b]])
+            along = axes[b] @ (anchors[b] - data.xanchor[b])
             anchors[b] = anchors[b] - along * axes[b]
-    averager.moved = dict(averager.shift)  # displacement of the frame of every link
     for body, link in averager.links.items():
         turning = [j for j in link.joints if int(model.jnt_type[j]) in (HINGE, BALL)]
         if turning:
             averager.moved[body] = anchors[turning[0]] - data.xanchor[turning[0]]
     for body, link in averager.links.items():
-        if body and body not in averager.carried:
+        if body and not is_loose(model, body):
             _write_body(averager, body, link.joints, anchors, axes)
 
 
@@ -62,8 +44,6 @@ def _write_body(averager: Averager, body: int, joints: list[int], anchors: dict,
     name = name_of(model, "body", body)
     for j in reversed(joints):
         kind, joint = int(model.jnt_type[j]), averager.spec.joints[j]
-        if kind == FREE:
-            break
         label = name_of(model, "joint", j)
         axis, at = turn.T @ axes[j], turn.T @ (anchors[j] - place)
         angle = float(data.qpos[model.jnt_qposadr[j]] - model.qpos0[model.jnt_qposadr[j]])
@@ -83,6 +63,6 @@ def _write_body(averager: Averager, body: int, joints: list[int], anchors: dict,
         turn = turn @ rotation(q).T
         place = anchors[j] - turn @ at
     parent = int(model.body_parentid[body])
-    base = data.xpos[parent] + averager.moved[int(model.body_weldid[parent])]
+    base = data.xpos[parent] + averager.moved[int(weld_ids(model)[parent])]
     outer = averager.rotation[parent]
     averager.pose(averager.spec.bodies[body], outer.T @ (place - base), outer.T @ turn, "body", name)

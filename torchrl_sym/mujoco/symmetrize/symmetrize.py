@@ -17,11 +17,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.audit.geoms import PLANE
+from torchrl_sym.mujoco.model.shapes import PLANE
 from torchrl_sym.mujoco.symmetrize.averager import Averager, MjSpec
 from torchrl_sym.mujoco.symmetrize.inertials import average_inertials
 from torchrl_sym.mujoco.symmetrize.parameters import average_actuators, average_joints
-from torchrl_sym.mujoco.symmetrize.places import place_joints, place_trees
+from torchrl_sym.mujoco.symmetrize.places import place_joints
 from torchrl_sym.mujoco.symmetrize.report import SymmetrizeReport
 from torchrl_sym.mujoco.symmetrize.shapes import PRIMITIVE, average_geoms, average_sites
 
@@ -33,6 +33,7 @@ def symmetrize(
     *,
     tolerance: float = 1e-2,
     carried: Sequence[str] = (),
+    axis: tuple[float, float] | None = None,
 ) -> MjSpec:
     """A copy of a model that is exactly symmetric; see :func:`symmetrize_with_report`.
 
@@ -46,7 +47,7 @@ def symmetrize(
         >>> symmetrize(spec, PointGroup.reflection("y")).compile().body("left").mass.item()
         1.0
     """
-    return symmetrize_with_report(spec, group, keyframe, tolerance=tolerance, carried=carried)[0]
+    return symmetrize_with_report(spec, group, keyframe, tolerance=tolerance, carried=carried, axis=axis)[0]
 
 
 def symmetrize_with_report(
@@ -56,6 +57,7 @@ def symmetrize_with_report(
     *,
     tolerance: float = 1e-2,
     carried: Sequence[str] = (),
+    axis: tuple[float, float] | None = None,
 ) -> tuple[MjSpec, SymmetrizeReport]:
     """A copy of a model that is exactly symmetric, and what was changed for it.
 
@@ -71,20 +73,21 @@ def symmetrize_with_report(
 
     Args:
         spec: the model; it is not modified.
-        group: the group that the model nearly has, about the vertical through the world's origin.
-        keyframe: a pose that the group keeps, by name or number. Defaults to ``qpos0``.
+        group: the group that the model nearly has.
+        keyframe: a pose that the group keeps, by name or number; by default it is found, as in
+            :func:`~torchrl_sym.mujoco.derive`.
         tolerance: how far joints, sites and geoms may be from their image's, as in
             :func:`~torchrl_sym.mujoco.derive`.
         carried: names of bodies that a turn of the world only carries along, as in
             :func:`~torchrl_sym.mujoco.derive`. They need no symmetry and are left as they are.
+        axis: a point (x, y) of the axis that the group acts about; by default it is found.
 
     Raises:
         SymmetryError: a joint or actuator has no image, or a body cannot be carried by an element; the
             message names it.
         KeyError: no such keyframe, or no such body to be carried.
     """
-    averager = Averager(spec, group, keyframe, tolerance, carried)
-    place_trees(averager)
+    averager = Averager(spec, group, keyframe, tolerance, carried, axis)
     place_joints(averager)
     average_inertials(averager)
     average_joints(averager)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchrl_sym.mujoco.model.shapes import touching
+from torchrl_sym.mujoco.model.filters import Filters
 from torchrl_sym.mujoco.model.types import BALL, FREE, SLIDE, Array, MjData, MjModel, mj
 from torchrl_sym.mujoco.verify.states import PhysicsState, touches, write_state
 
@@ -108,19 +108,5 @@ def reach_contact(model: MjModel, state: PhysicsState, generator: torch.Generato
 
 def can_touch(model: MjModel) -> bool:
     """Whether any two geoms collide when they meet: not of one link, of parent and child, or excluded."""
-    if model.opt.disableflags & int(mj.mjtDisableBit.mjDSBL_CONTACT):
-        return False
-    if model.npair:
-        return True
-    pairs = np.argwhere(np.triu(touching(model)))
-    link = model.body_weldid[model.geom_bodyid[pairs]]
-    if not model.opt.disableflags & int(mj.mjtDisableBit.mjDSBL_FILTERPARENT):
-        parent = model.body_weldid[model.body_parentid[link]]
-        near = (link == parent[:, ::-1]) & (link != 0) & (parent[:, ::-1] != 0)
-        pairs, link = pairs[~near.any(axis=1)], link[~near.any(axis=1)]
-    excluded = {int(signature) for signature in model.exclude_signature}
-    bodies = model.geom_bodyid[pairs]
-    return any(
-        (min(a, b) << 16) + max(a, b) not in excluded and (max(a, b) << 16) + min(a, b) not in excluded
-        for a, b in bodies.tolist()
-    )
+    filters = Filters(model)
+    return bool(filters.may.any() or filters.pairs)
