@@ -1,5 +1,7 @@
 """infer: the observation's representation from the simulator; what cannot be known is refused by name."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,9 @@ from dm_control import suite
 
 import tasks
 from torchrl_sym import PointGroup, Symmetry
-from torchrl_sym.mujoco import InferenceError, derive, infer, verify
+from torchrl_sym.mujoco import InferenceError, Remembered, derive, infer, verify
+from torchrl_sym.mujoco.infer.observations import ObservationFinder
+from torchrl_sym.mujoco.infer.samples import Samples
 from torchrl_sym.representations import (
     Representation,
     axial,
@@ -327,6 +331,43 @@ def test_dm_control_suite(name):
     for key, text in SUITE[name].items():
         signs = torch.tensor([1.0 if s == "+" else -1.0 for s in text], dtype=torch.float64)
         assert torch.equal(symmetry[key].matrices[1], torch.diag(signs))
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_what_only_later_samples_contradict_is_no_image(late):
+    """Two entries that are exchanged in the samples solved from, but not in those held out."""
+    data = np.random.default_rng(0).standard_normal((90, 2))
+    image = data[:, ::-1].copy()
+    image[75, 0] += 0.5 * late
+    values = torch.as_tensor(np.stack([data, image]))
+    samples = Samples(
+        shapes={"x": torch.Size([2])},
+        dtypes={"x": torch.float64},
+        values={"x": values},
+        hidden={"x": torch.zeros(2)},
+        quantities=torch.zeros(90, 0),
+    )
+    finder = ObservationFinder(SimpleNamespace(samples=samples), MIRROR, 1e-4)
+    solution = finder._solve(("x",), known=60)
+    assert solution.surprised.any() == late
+    assert solution.complete != late
+
+
+def test_a_target_kept_in_the_model_is_handed_over():
+    def load(env, values):
+        env.physics.named.model.geom_pos["target"] = values["target"]
+
+    memory = Remembered(
+        {"target": polar(MIRROR)},
+        lambda env: {"target": np.array(env.physics.named.model.geom_pos["target"])},
+        load,
+    )
+    env = suite.load("reacher", "easy", task_kwargs={"random": 0})
+    with pytest.raises(InferenceError, match=r"to_target\[0\].*two observations of one state"):
+        infer(env, MIRROR)
+    symmetry = infer(env, MIRROR, memory=memory)
+    assert torch.equal(symmetry["to_target"].matrices[1].diagonal(), torch.tensor([1.0, -1.0]).double())
+    assert verify(env, symmetry, states=4, steps=2, memory=memory).passed
 
 
 def test_our_tasks_as_declared():
