@@ -186,6 +186,24 @@ def test_a_mixing_base_that_does_not_start_at_zero_has_offsets():
     assert worst_step(model, C3) <= 1e-9
 
 
+def test_a_base_that_leans_a_little_still_has_an_exact_representation():
+    leaning = (
+        planar()
+        .replace('axis="1.0 0.0 0"', 'axis="1 0 .002"')
+        .replace('axis="-0.0 1.0 0"', 'axis="0 1 -.001"')
+    )
+    robot = derive(compiled(leaning), C3)  # which checks that it composes
+    assert robot.joints(["x", "y"]).matrices[1, 0, 0] == pytest.approx(-0.5, abs=1e-5)
+    assert 1e-6 < worst_step(compiled(leaning), C3) < 1e-2
+
+
+def test_a_mixing_base_may_stand_aside():
+    model = compiled(planar(place=".3 -.2 .5"), MOTORS)
+    robot = derive(model, C3)
+    assert robot.axis == pytest.approx((0.3, -0.2))
+    assert worst_step(model, C3) <= 1e-9
+
+
 def test_what_slides_cannot_mix_is_refused():
     with pytest.raises(SymmetryError, match="'rot-120'"):  # two hinges do not mix
         derive(compiled(planar(kinds="hinge hinge")), C3)
