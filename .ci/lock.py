@@ -1,14 +1,14 @@
-"""Write constraints-hashes.txt: the files that CI may install, each with its SHA-256.
+"""Write the files that CI may install, each with its SHA-256: constraints-hashes.txt and -mjlab-hashes.txt.
 
-    make lock    # whenever constraints.txt has changed
+    make lock    # whenever constraints.txt or constraints-mjlab.txt has changed
 
-For every Python that the project runs on, pip says which wheel of each pinned version it would install on
-Linux (x86_64) and what the wheel's hash is; nothing is installed. torch is the CPU build, whose files are
-not on PyPI: pip has to find them, as CI does, by
+For every Python that a file is for, pip says which wheel of each pinned version it would install on Linux
+(x86_64) and what the wheel's hash is; nothing is installed. torch is the CPU build, whose files are not on
+PyPI: pip has to find them, as CI does, by
 
     export PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
 
-Only CI installs from that file. constraints.txt stays without hashes: pip would then demand one for
+Only CI installs from these files. The constraints stay without hashes: pip would then demand one for
 everything, the project itself and other builds of torch included.
 """
 
@@ -20,14 +20,20 @@ import sys
 import tempfile
 from pathlib import Path
 
+from packaging.requirements import Requirement
+
 ROOT = Path(__file__).parent.parent
-CONSTRAINTS, HASHES = ROOT / "constraints.txt", ROOT / "constraints-hashes.txt"
-PYTHONS = ("3.11", "3.12")
+# What is locked, and for which Pythons.
+LOCKED = {"constraints": ("3.10", "3.11", "3.12", "3.13", "3.14"), "constraints-mjlab": ("3.11",)}
 # Wheels for the oldest glibc that torch 2.13 runs on; every newer Linux takes them too.
 PLATFORMS = [*(f"manylinux_2_{minor}_x86_64" for minor in range(28, 4, -1)), "manylinux2014_x86_64"]
-HEADER = f"""\
-# constraints.txt with the hash of every file that CI may install; made by `make lock`, see .ci/lock.py.
-# Linux (x86_64), Python {" and ".join(PYTHONS)}.
+
+
+def header(name: str) -> str:
+    """The first lines of a file with hashes."""
+    return f"""\
+# {name}.txt with the hash of every file that CI may install; made by `make lock`, see .ci/lock.py.
+# Linux (x86_64), Python {", ".join(LOCKED[name])}.
 """
 
 
@@ -36,19 +42,22 @@ def normalized(name: str) -> str:
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
-def pinned(text: str) -> dict[str, str]:
-    """Name to version of every ``name==version``, in the order of the file."""
-    return dict(re.findall(r"^([\w.-]+)==([^\s\\]+)", text, re.MULTILINE))
+def pinned(text: str) -> list[Requirement]:
+    """Every ``name==version; marker`` of a file, with or without hashes."""
+    lines = re.findall(r"^[\w.-]+==[^\\\n]+", text, re.MULTILINE)
+    return [Requirement(line) for line in lines]
 
 
-def files(python: str) -> dict[str, tuple[str, str]]:
+def files(requirements: list[Requirement], python: str) -> dict[str, tuple[str, str]]:
     """What pip would install for one Python: normalized name to version and SHA-256."""
+    # pip evaluates markers for the Python it runs on, whatever --python-version says
+    asked = [r for r in requirements if r.marker is None or r.marker.evaluate({"python_version": python})]
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         command = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed"]
         command += ["--no-deps", "--only-binary", ":all:", "--python-version", python, "--target", folder]
         command += [part for platform in PLATFORMS for part in ("--platform", platform)]
-        command += ["--report", str(report), "--requirement", str(CONSTRAINTS)]
+        command += ["--report", str(report), *(f"{r.name}{r.specifier}" for r in asked)]
         subprocess.run(command, check=True, env=os.environ | {"PIP_CONSTRAINT": os.devnull})
         installed = json.loads(report.read_text())["install"]
     return {
@@ -60,23 +69,31 @@ def files(python: str) -> dict[str, tuple[str, str]]:
     }
 
 
-def main() -> None:
-    """Ask pip for every Python, and write what all of them need."""
-    found = {python: files(python) for python in PYTHONS}
+def locked(name: str) -> str:
+    """Constraints with the hash of every file, for all Pythons that they are for."""
+    requirements = pinned((ROOT / f"{name}.txt").read_text())
+    found = {python: files(requirements, python) for python in LOCKED[name]}
     for python, chosen in found.items():
-        version, _ = chosen["torch"]
+        version, _ = chosen.get("torch", ("+cpu", ""))
         if not version.endswith("+cpu"):
             sys.exit(
                 f"expected the CPU build of torch for Python {python}, got {version}; "
                 "export PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu and try again"
             )
-    lines = [HEADER]
-    for name, version in pinned(CONSTRAINTS.read_text()).items():
-        hashes = sorted({chosen[normalized(name)][1] for chosen in found.values()})
-        lines.append(
-            " \\\n    ".join([f"{name}=={version}", *(f"--hash=sha256:{x}" for x in hashes)]) + "\n"
-        )
-    HASHES.write_text("".join(lines))
+    lines = [header(name)]
+    for requirement in requirements:
+        package, version = normalized(requirement.name), str(requirement.specifier).removeprefix("==")
+        chosen = {files_of.get(package, ("", "")) for files_of in found.values()}
+        hashes = sorted(hash_ for release, hash_ in chosen if release.partition("+")[0] == version)
+        lines.append(" \\\n    ".join([str(requirement), *(f"--hash=sha256:{x}" for x in hashes)]) + "\n")
+    return "".join(lines)
+
+
+def main() -> None:
+    """Ask pip for every Python, and write what all of them need."""
+    texts = {name: locked(name) for name in LOCKED}
+    for name, text in texts.items():
+        (ROOT / f"{name}-hashes.txt").write_text(text)
 
 
 if __name__ == "__main__":

@@ -1,108 +1,78 @@
-"""Which symmetries public MuJoCo models have: audits them all and writes docs/models.md.
+"""Which symmetries public MuJoCo models have, against what they ought to have: writes docs/models.md.
 
-python benchmarks/models.py
+    python benchmarks/models.py                                what is installed: gymnasium, dm_control, ...
+    python benchmarks/models.py --menagerie ~/mujoco_menagerie and a checkout of mujoco_menagerie
+    python benchmarks/models.py --only "menagerie/unitree_*"   a part of it, printed
+
+Every model is examined in a process of its own, with a time limit: what does not compile, hangs or fails is
+a row of the page and stops nothing. The exit status is 1 if a verdict, or a pair of left and right, is
+against benchmarks/catalogue/expectations.toml.
 """
 
-import copy
-import importlib
-import warnings
+import sys
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from importlib import metadata
 from pathlib import Path
 
-import gymnasium
 import mujoco
-import numpy as np
-import torch
-from dm_control import suite
+import tyro
 
-from torchrl_sym import PointGroup
-from torchrl_sym.mujoco import AuditReport, audit, derive
+from catalogue import expectations, sources
+from catalogue.page import page
+from catalogue.run import examine_all
+from comparison.files import write_whole
 
-SUITE = (
-    *("cartpole", "acrobot", "pendulum", "reacher", "ball_in_cup"),
-    *("humanoid", "cheetah", "walker", "hopper"),
-)
-BUILT = {"quadruped": "walk", "swimmer": "swimmer6"}  # their models are assembled when they are loaded
-GROUPS = {
-    "reflect-x": PointGroup.reflection("x"),
-    "reflect-y": PointGroup.reflection("y"),
-    "rot-180": PointGroup.rotation(2),
-    "rot-120": PointGroup.rotation(3),
-    "rot-90": PointGroup.rotation(4),
-}
-HEADER = """# Which symmetries public models have
-
-Made by `python benchmarks/models.py`: `derive` and `audit` of each model at its reference pose. *exact*:
-every term agrees to 1e-8; *step* is the largest velocity error of a mirrored step against the step of the
-mirror, at 16 states reached by random controls, contact included (elliptic cones, Newton). *approximate*:
-the largest residual and where it is. *no*: the first thing that has no counterpart. Planar models
-(cart-pole, cheetah, walker, ...) do not move along y, so that reflect-y changes nothing in most of them; in
-the walker it exchanges the legs.
-"""
+DOCS = Path(__file__).parents[1] / "docs"
 
 
-def models() -> dict[str, mujoco.MjModel]:
-    assets = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-    found = {"gymnasium Ant": mujoco.MjModel.from_xml_path(str(assets / "ant.xml"))}
-    for name in SUITE:
-        xml, files = importlib.import_module(f"dm_control.suite.{name}").get_model_and_assets()
-        found[name] = mujoco.MjModel.from_xml_string(xml, files)
-    for name, task in BUILT.items():
-        found[name] = suite.load(name, task).physics.model.ptr
-    return found
+@dataclass
+class Arguments:
+    """Examine public models and write the page about them."""
+
+    menagerie: Path | None = None
+    """A checkout of mujoco_menagerie."""
+    also: tuple[Path, ...] = ()
+    """Further folders of models; each is a source under its own name."""
+    only: tuple[str, ...] = ()
+    """Patterns of keys to examine; with them the page is printed, not written."""
+    out: Path = DOCS / "models.md"
+    """Where the page goes."""
+    workers: int = 2
+    """Processes at a time."""
+    limit: float = 60.0
+    """Seconds for each model."""
 
 
-def step_residual(model: mujoco.MjModel, group: PointGroup, states: int = 16, warm_up: int = 60) -> float:
-    """Largest velocity error of a mirrored step against the step of the mirror, over reached states.
-
-    With elliptic cones and the Newton solver, whatever the model asks for: others break the symmetry.
-    """
-    model = copy.deepcopy(model)
-    model.opt.cone, model.opt.solver = mujoco.mjtCone.mjCONE_ELLIPTIC, mujoco.mjtSolver.mjSOL_NEWTON
-    robot, rng = derive(model, group), np.random.default_rng(0)
-    data, image, worst = mujoco.MjData(model), mujoco.MjData(model), 0.0
-    low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-1.0, 1.0)).T
-    for state in range(states):
-        if state % 4 == 0:
-            mujoco.mj_resetData(model, data)
-        for _ in range(warm_up):
-            data.ctrl[:] = rng.uniform(low, high)
-            mujoco.mj_step(model, data)
-        for g in range(1, group.order):
-            image.qpos[:] = robot.map_qpos(torch.as_tensor(data.qpos), g)
-            image.qvel[:] = robot.map_qvel(torch.as_tensor(data.qvel), g)
-            image.ctrl[:] = robot.map_ctrl(torch.as_tensor(data.ctrl), g)
-            image.act[:] = robot.map_act(torch.as_tensor(data.act), g)
-            image.qacc_warmstart[:] = robot.map_qvel(torch.as_tensor(data.qacc_warmstart), g)
-            original = copy.copy(data)
-            mujoco.mj_step(model, original)
-            mujoco.mj_step(model, image)
-            expected = robot.map_qvel(torch.as_tensor(original.qvel), g).numpy()
-            worst = max(worst, float(np.abs(expected - image.qvel).max()))
-    return worst
+def versions(found: list[sources.Source]) -> str:
+    """What the page was made of."""
+    packages = [source.name for source in found if source.name in sources.PACKAGES]
+    numbers = [f"{name.replace('_', '-')} {metadata.version(name)}" for name in packages]
+    return f"MuJoCo {mujoco.__version__}; {', '.join(numbers)}.\n"
 
 
-def cell(model: mujoco.MjModel, group: PointGroup) -> str:
-    report: AuditReport = audit(model, group)
-    if report.exact:
-        return f"exact, step {step_residual(model, group):.0e}"
-    if report.reason is not None:
-        return f"no: {report.reason.split(' under')[0].split(';')[0]}"
-    worst = report.worst
-    return f"approximate: {worst.residual:.2g}, {worst.term} of {worst.name}"
+def main(arguments: Arguments) -> int:
+    """Write or print the page; returns the exit status."""
+    found = sources.sources(arguments.menagerie, arguments.also)
+    wanted = expectations.read()
+    jobs = [
+        (key, path, expectations.expectation(key, wanted))
+        for source in found
+        for key, path in source.files()
+        if not arguments.only or any(fnmatchcase(key, pattern) for pattern in arguments.only)
+    ]
+    rows = examine_all(jobs, arguments.workers, arguments.limit)
 
-
-def main() -> None:
-    warnings.simplefilter("ignore")
-    lines = [["model", *GROUPS], ["---"] * (len(GROUPS) + 1)]
-    for name, model in models().items():
-        lines.append([name, *(cell(model, group) for group in GROUPS.values())])
-        print(" | ".join(lines[-1]))
-    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    path = Path(__file__).parents[1] / "docs" / "models.md"
-    path.write_text(
-        f"{HEADER}\nMuJoCo {mujoco.__version__}, gymnasium {gymnasium.__version__}.\n\n{table}\n"
-    )
+    text = page(rows, wanted, found, versions(found))
+    if arguments.only:
+        print(text)
+    else:
+        write_whole(arguments.out, text)
+    for row in rows:
+        for complaint in row.against:
+            print(f"{row.key}: {complaint}", file=sys.stderr)
+    return int(any(row.against for row in rows))
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main(tyro.cli(Arguments)))

@@ -5,7 +5,7 @@
 
 Every table compares our code with its limit in one run: environments with raw physics, losses with plain
 ClipPPOLoss and with bare torch of the same arithmetic, augmentation with a copy of memory, iterations of
-training with rsl_rl's (where it is installed, see peer.py). The variants of
+training with rsl_rl's (where it is installed, see peer.py), audits with derive. The variants of
 a row are timed in turn, round by round, so that a machine that slows down slows all of them; a figure is
 the median over rounds, a ratio the median of the rounds' ratios. One torch thread.
 """
@@ -38,6 +38,7 @@ from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOpe
 from torchrl.objectives import ClipPPOLoss
 
 import tasks
+from audits import measure_audits
 from iterations import measure_iterations, measure_options
 from measuring import cell, interleave, ratio, show
 from peer import INSTALLED
@@ -52,7 +53,7 @@ LOSS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01, "critic_coeff": 1.0, "loss_c
 class Arguments:
     """Measure and print ratios."""
 
-    only: Literal["env", "loss", "augment", "iteration", "options"] | None = None
+    only: Literal["env", "loss", "augment", "audit", "iteration", "options"] | None = None
     """One of the tables; that of options, which compiles for minutes, is made only if it is asked for."""
     tasks: tuple[str, ...] = tasks.ALL_TASKS
     """Tasks whose environments are timed."""
@@ -326,11 +327,11 @@ def measure_augmentation(arguments: Arguments) -> list[dict]:
     return table
 
 
-# --- training
+# --- tables of other files
 
 
-def measure_training(arguments: Arguments, measure: Callable) -> list[dict]:
-    """A table of iterations.py."""
+def measure_rows(arguments: Arguments, measure: Callable) -> list[dict]:
+    """A table of iterations.py or audits.py."""
     print(f"\n{measure.__doc__}")
     table = []
     for row in measure(arguments.tasks, arguments.rounds):
@@ -343,8 +344,9 @@ TABLES: dict[str, Callable[[Arguments], list[dict]]] = {
     "env": measure_envs,
     "loss": measure_losses,
     "augment": measure_augmentation,
-    "iteration": functools.partial(measure_training, measure=measure_iterations),
-    "options": functools.partial(measure_training, measure=measure_options),
+    "audit": functools.partial(measure_rows, measure=measure_audits),
+    "iteration": functools.partial(measure_rows, measure=measure_iterations),
+    "options": functools.partial(measure_rows, measure=measure_options),
 }
 
 

@@ -18,11 +18,12 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import mujoco
 import torch
 from torch import Tensor
+from typing_extensions import Self  # of typing since Python 3.11
 
 from tasks.draws import check_generator
 from tasks.simulation import Simulation

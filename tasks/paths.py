@@ -9,6 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from torchrl_sym.extras import require
+
+require("tasks.paths", "tasks", {"matplotlib": ""})
+
 import mujoco
 import numpy as np
 import torch

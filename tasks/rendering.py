@@ -15,6 +15,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from torchrl_sym.extras import require
+
+require("tasks.rendering", "tasks", {"PIL": ""})
+
 import mujoco
 import numpy as np
 import torch
@@ -270,13 +274,8 @@ def save(path: str | os.PathLike, frames: Sequence[np.ndarray], fps: float = 25.
 
 
 def _save_mp4(path: Path, frames: Sequence[np.ndarray], fps: float) -> None:
-    try:
-        import imageio
-        import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            f"expected imageio and imageio-ffmpeg to write {path.name}, got {error}; "
-            "pip install imageio imageio-ffmpeg, or write a .gif"
-        ) from error
+    require(f"writing {path.name}", "video", {"imageio": "", "imageio_ffmpeg": ""}, "or write a .gif")
+    import imageio
+
     even = [frame[: len(frame) // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]  # h264 wants it
     imageio.mimwrite(path, even, fps=fps, macro_block_size=2)  # type: ignore[arg-type]

@@ -89,10 +89,14 @@ def mjcf(
         own = WORLD if frames is None else random_rotation(frames)
         quat = np.zeros(4)
         mujoco.mju_mat2Quat(quat, (parent.T @ own).flatten())
-        inertia = own.T @ limb.inertia @ own
-        full = (*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2])
+        # principal moments and axes: the compiler of MuJoCo 3.11 finds them in a full inertia to 1e-7 only
+        moments, axes = np.linalg.eigh(limb.inertia)
+        axes[:, 0] *= np.linalg.det(axes)
+        turn = np.zeros(4)
+        mujoco.mju_mat2Quat(turn, (own.T @ axes).flatten())
         parts = [
-            f'<inertial pos="{text(own.T @ limb.com)}" mass="{limb.mass!r}" fullinertia="{text(full)}"/>'
+            f'<inertial pos="{text(own.T @ limb.com)}" mass="{limb.mass!r}" '
+            f'quat="{text(turn)}" diaginertia="{text(moments)}"/>'
         ]
         if limb.joint is not None:
             limits = f' range="{text(np.degrees(limb.range))}"' if limb.range else ""

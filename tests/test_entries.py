@@ -139,10 +139,10 @@ def test_left_and_right_change_places(prefix, form):
     bare = prefix[prefix == ("next",) :]
     symmetry = Symmetry(GROUP, {Exchanged((*bare, "left"), (*bare, "right")): both})
     td = TensorDict(batch_size=[1])
-    td[*prefix, "left"], td[*prefix, "right"] = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0]])
+    td[(*prefix, "left")], td[(*prefix, "right")] = torch.tensor([[1.0, 2.0]]), torch.tensor([[3.0, 4.0]])
     for image in (symmetry(td, 1), symmetry.orbit(td)[1], symmetry(td, torch.ones(1, dtype=torch.long))):
-        assert image[*prefix, "left"].tolist() == [[-3.0, 4.0]]
-        assert image[*prefix, "right"].tolist() == [[-1.0, 2.0]]
+        assert image[(*prefix, "left")].tolist() == [[-3.0, 4.0]]
+        assert image[(*prefix, "right")].tolist() == [[-1.0, 2.0]]
     assert symmetry.together([(*prefix, "left")]) == [
         symmetry.together([(*prefix, "left")])[0],
         (*prefix, "right") if prefix else "right",
@@ -150,7 +150,7 @@ def test_left_and_right_change_places(prefix, form):
     with pytest.raises(KeyError, match="change places"):
         symmetry(td.exclude((*prefix, "right")), 1)
     with pytest.raises(KeyError, match="change places"):
-        symmetry[*bare, "left"]
+        symmetry[(*bare, "left")]
     with pytest.raises(ValueError, match="event dimensions"):
         symmetry(td.set((*prefix, "right"), torch.zeros(1, 3)), 1)
 

@@ -264,9 +264,34 @@ def test_bad_generators_are_refused(generator, message):
         PointGroup.generate({"g": generator})
 
 
-@pytest.mark.parametrize("axis", ["z", "X", 0])
+@pytest.mark.parametrize(("degrees", "name"), [(0, "reflect-x"), (90.0, "reflect-y"), (-30, "reflect-150")])
+def test_reflection_takes_the_angle_of_its_normal(degrees, name):
+    group = PointGroup.reflection(degrees)
+    assert group.names == ("identity", name)
+    angle = math.radians(degrees)
+    normal = torch.tensor([math.cos(angle), math.sin(angle), 0.0], dtype=torch.float64)
+    torch.testing.assert_close(group.matrices[1] @ normal, -normal)
+
+
+@pytest.mark.parametrize("group", [PointGroup.dihedral(3), PointGroup.klein_four(), PointGroup.rotation(5)])
+def test_turned_groups_are_conjugate(group):
+    moved, turn = group.turned(20.0), PointGroup.generate({"t": PointGroup.rotation(18).matrices[1]})
+    expected = {
+        tuple((turn.matrices[1] @ m @ turn.matrices[1].mT).flatten().tolist()) for m in group.matrices
+    }
+    for matrix in moved.matrices:
+        nearest = min(
+            max(abs(a - b) for a, b in zip(matrix.flatten().tolist(), m, strict=True)) for m in expected
+        )
+        assert nearest < 1e-12
+    assert moved.turned(-20.0) == group
+
+
+@pytest.mark.parametrize("axis", ["z", "X", None])
 def test_reflection_takes_a_horizontal_axis(axis):
-    with pytest.raises(ValueError, match=r"expected axis 'x' or 'y', got.*PointGroup.generate"):
+    with pytest.raises(
+        ValueError, match=r"expected axis 'x' or 'y', or its angle.*got.*PointGroup.generate"
+    ):
         PointGroup.reflection(axis)
 
 

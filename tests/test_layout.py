@@ -22,18 +22,22 @@ MAX_LINES = 400
 # Reading order is dependency order. A module imports from its own layer (without cycles) and from
 # the layers above it in this list. `__init__` collects them all, so none of them imports it.
 LAYERS = (
-    "checks _torchrl",
+    "checks extras _torchrl",
     "groups",
     "representations",
-    "entries normalization",
-    "declaration",
+    "entries normalization segments",
+    "declaration files printing",
     "environments",
     "symmetry",
     "orbits memory networks outputs",
     "augment transforms replay mirror_loss symmetric_ppo modules vecnorm mujoco testing",
+    "bridges",
     "recipes",
     "__init__",
 )
+
+# The same for the rooms of torchrl_sym.mujoco, one per verb.
+ROOMS = ("model", "derive", "audit symmetrize verify", "symmetries infer", "__init__ __main__")
 
 # Top-level packages that the files of a folder must not import.
 FORBIDDEN = {
@@ -63,33 +67,35 @@ def imported_names(path: Path, root: Path) -> Iterator[str]:
             yield from (f"{base}.{alias.name}" for alias in node.names)
 
 
-def library_imports(root: Path) -> dict[str, set[str]]:
-    """Module of torchrl_sym -> modules of torchrl_sym it imports (a subpackage counts as one)."""
-    folder = root / "torchrl_sym"
+def library_imports(root: Path, inside: tuple[str, ...] = ()) -> dict[str, set[str]]:
+    """Module of torchrl_sym (or of a package inside) -> others there it imports; a subpackage is one."""
+    above = ("torchrl_sym", *inside)
+    folder = root.joinpath(*above)
     modules = {path.stem for path in folder.iterdir() if path.suffix == ".py" or path.is_dir()}
     modules.discard("__pycache__")
     graph: dict[str, set[str]] = {}
-    for path in python_files(root, "torchrl_sym"):
+    for path in python_files(folder, "."):
         module = Path(path.relative_to(folder).parts[0]).stem
         graph.setdefault(module, set())
         for name in imported_names(path, root):
-            package, *rest = name.split(".")
-            if package == "torchrl_sym":
+            parts = tuple(name.split("."))
+            if parts[: len(above)] == above:
+                rest = parts[len(above) :]
                 target = rest[0] if rest and rest[0] in modules else "__init__"
                 graph[module] |= {target} - {module}
     return graph
 
 
-def wrong_layers(root: Path) -> list[str]:
-    graph = library_imports(root)
-    rank = {module: number for number, layer in enumerate(LAYERS) for module in layer.split()}
+def wrong_layers(root: Path, layers: tuple[str, ...] = LAYERS, inside: tuple[str, ...] = ()) -> list[str]:
+    graph, above = library_imports(root, inside), ".".join(("torchrl_sym", *inside))
+    rank = {module: number for number, layer in enumerate(layers) for module in layer.split()}
     complaints = [
-        f"torchrl_sym.{module} has no layer: add it to LAYERS in tests/test_layout.py"
+        f"{above}.{module} has no layer: add it to LAYERS or ROOMS in tests/test_layout.py"
         for module in graph
         if module not in rank
     ]
     complaints += [
-        f"torchrl_sym.{module} imports torchrl_sym.{target}, which comes after it"
+        f"{above}.{module} imports {above}.{target}, which comes after it"
         for module, targets in graph.items()
         for target in sorted(targets)
         if rank.get(target, 0) > rank.get(module, len(LAYERS))
@@ -97,8 +103,12 @@ def wrong_layers(root: Path) -> list[str]:
     try:
         graphlib.TopologicalSorter(graph).prepare()
     except graphlib.CycleError as error:
-        complaints.append(f"cycle in torchrl_sym: {' <- '.join(error.args[1])}")
+        complaints.append(f"cycle in {above}: {' <- '.join(error.args[1])}")
     return complaints
+
+
+def wrong_rooms(root: Path) -> list[str]:
+    return wrong_layers(root, ROOMS, ("mujoco",)) if (root / "torchrl_sym" / "mujoco").is_dir() else []
 
 
 def forbidden_imports(root: Path) -> list[str]:
@@ -185,7 +195,7 @@ def tracked_files() -> list[str]:
     return [name for name in listing.split("\0") if name]
 
 
-@pytest.mark.parametrize("rule", [wrong_layers, forbidden_imports, long_files, prints])
+@pytest.mark.parametrize("rule", [wrong_layers, wrong_rooms, forbidden_imports, long_files, prints])
 def test_repository(rule):
     assert not rule(ROOT)
 
@@ -246,6 +256,19 @@ def test_wrong_layers_are_found(tmp_path, module, source, complaint):
     files |= {"modules": "import torchrl_sym.transforms", module: source}
     root = write_tree(tmp_path, {f"torchrl_sym/{name}.py": text for name, text in files.items()})
     assert complaint in "\n".join(wrong_layers(root))
+
+
+def test_wrong_rooms_are_found(tmp_path):
+    good = {
+        "torchrl_sym/mujoco/__init__.py": "from torchrl_sym.mujoco.derive import derive",
+        "torchrl_sym/mujoco/model/links.py": "import torch",
+        "torchrl_sym/mujoco/derive/derive.py": "from torchrl_sym.mujoco.model.links import Link",
+    }
+    assert not wrong_rooms(write_tree(tmp_path, good))
+    bad = {"torchrl_sym/mujoco/model/links.py": "from torchrl_sym.mujoco.derive.derive import derive"}
+    complaints = "\n".join(wrong_rooms(write_tree(tmp_path, bad)))
+    assert "torchrl_sym.mujoco.model imports torchrl_sym.mujoco.derive, which comes after it" in complaints
+    assert "cycle in torchrl_sym.mujoco" in complaints
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from packaging.version import Version
 
 from torchrl_sym import PointGroup
 from torchrl_sym.mujoco import audit, derive
-from torchrl_sym.mujoco.audit.contacts import colliding_geoms
+from torchrl_sym.mujoco.model.filters import Filters
 
 MIRROR = PointGroup.reflection("y")
 NATIVE, LIBCCD = "", '<flag nativeccd="disable"/>'
@@ -43,6 +44,7 @@ EXACT = {
     *itertools.product(["sphere"], ["sphere", "capsule", "cylinder", "box"]),
     *(("capsule", "capsule"), ("capsule", "box"), ("box", "box")),
 }
+LATELY = {("capsule", "mesh"), ("box", "mesh"), ("mesh", "mesh")}  # MuJoCo 3.11 mirrors nearly all of them
 KINDS = ["sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh"]
 PAIRS = [
     *itertools.product(["plane"], SHAPES),
@@ -121,7 +123,8 @@ def test_warns_of_the_contacts_that_are_not_mirrored(pair, flag):
             {"hfield": "height field", "prism": "mesh", "slab": "mesh"}.get(kind, kind) for kind in pair
         ]
         assert report.warnings[0].startswith(f"contacts of {words[0]} with {words[1]} (")
-        assert any(error > 1e-8 for error in step_errors(model, runs=100))
+        if pair not in LATELY or flag != NATIVE or Version(mujoco.__version__) >= Version("3.17"):
+            assert any(error > 1e-8 for error in step_errors(model, runs=100))
 
 
 SILENT = ('<flag contact="disable"/>', '<flag constraint="disable"/>')
@@ -156,7 +159,13 @@ def test_geoms_that_may_collide_are_those_that_do_when_all_overlap(flag, more):
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     touching = {tuple(sorted(map(int, pair))) for pair in data.contact.geom}
-    assert set(colliding_geoms(model)) == touching
+    filters = Filters(model)
+    allowed = {
+        (a, b)
+        for a, b in itertools.combinations(range(model.ngeom), 2)
+        if filters.may[filters.of[a], filters.of[b]]
+    }
+    assert allowed | filters.pairs == touching
     assert bool(touching) == (flag not in SILENT)
 
 

@@ -55,9 +55,9 @@ def test_derivation_takes_less_than_50_ms(robot, group):
     compiled = model(*robot)
     seconds = []
     for _ in range(20):
-        start = time.perf_counter()
+        start = time.process_time()
         derive(compiled, group)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     assert min(seconds) < 0.05
 
 

@@ -11,7 +11,6 @@ from dm_control.rl import control
 from torchrl.envs import GymWrapper
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
-import tasks
 from torchrl_sym import PointGroup, Symmetry
 from torchrl_sym.mujoco import Remembered, derive, verify
 from torchrl_sym.representations import scalar
@@ -278,6 +277,10 @@ def test_errors_say_what_to_do(make):
         Remembered(LAST, save=lambda env: {})
     with pytest.raises(KeyError, match=r"save: expected values for \['last', 'last2'\], got \['last'\]"):
         report_of(env, ARMS * 4, Remembered(LAST, lambda env: {"last": env.last}, lambda env, values: None))
+
+
+def test_our_tasks_remember_in_their_state():
+    tasks = pytest.importorskip("tasks", reason="our tasks need MuJoCo 3.17", exc_type=ImportError)
     batched = tasks.make_env("cartpole", num_envs=2, num_threads=1)
     with pytest.raises(ValueError, match=r"got None, \(\) and \['last'\]; leave them out, and keep"):
         verify(batched, batched.symmetry, memory={"last": batched.symmetry["action"]})

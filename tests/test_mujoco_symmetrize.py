@@ -41,11 +41,10 @@ def perturb(spec: mujoco.MjSpec, seed: int) -> mujoco.MjSpec:
     for body in spec.bodies[1:]:
         body.mass, body.pos = off(body.mass), off(body.pos, 0.005)
         body.ipos = (np.array(body.ipos) + 1e-3 * rng.standard_normal(3)).tolist()
-        xx, yy, zz, xy, xz, yz = body.fullinertia
-        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-        turn = small_rotation(rng)
-        inertia = (1 + 0.01 * rng.standard_normal()) * turn @ inertia @ turn.T
-        body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]].tolist()
+        turn, turned = np.array([1.0, *(0.005 * rng.standard_normal(3))]), np.zeros(4)
+        mujoco.mju_mulQuat(turned, turn / np.linalg.norm(turn), body.iquat)
+        body.iquat = turned.tolist()
+        body.inertia = (np.array(body.inertia) * (1 + 0.01 * rng.standard_normal())).tolist()
         body.add_site(name=f"{body.name}_imu", pos=1e-3 * rng.standard_normal(3))
     for joint in spec.joints:
         if joint.type == mujoco.mjtJoint.mjJNT_FREE:
@@ -62,12 +61,6 @@ def perturb(spec: mujoco.MjSpec, seed: int) -> mujoco.MjSpec:
         if geom.type == mujoco.mjtGeom.mjGEOM_SPHERE:
             geom.pos, geom.size, geom.friction = off(geom.pos), off(geom.size), off(geom.friction)
     return spec
-
-
-def small_rotation(rng: np.random.Generator) -> np.ndarray:
-    out, q = np.zeros(9), np.array([1.0, *(0.005 * rng.standard_normal(3))])
-    mujoco.mju_quat2Mat(out, q / np.linalg.norm(q))
-    return out.reshape(3, 3)
 
 
 def worst_step(compiled, group, seeds=range(6)) -> float:
@@ -156,7 +149,7 @@ def test_offsets_frames_welded_bodies_capsules_and_boxes(keyframe):
     assert robot.table("joint", 1)["a"] == "b"
     assert max(step_residual(compiled, robot, 1, seed, steps=5)[0] for seed in range(6)) <= 1e-9
     found = audit(compiled, group, keyframe)
-    assert not found.exact
+    assert "scenery: not a symmetry (1: scenery geometry, reflect-y, lidar" in found.verdict
     assert "left alone: geom 'lidar' has no image" in str(report)
     assert compiled.body_mass.sum() == pytest.approx(spec.compile().body_mass.sum())
     after.delete(after.geom("lidar"))

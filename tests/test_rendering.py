@@ -109,7 +109,7 @@ def test_save(tmp_path, monkeypatch):
     about = next(read)
     assert (about["size"], about["fps"], len(list(read))) == ((32, 24), 10.0, 3)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    with pytest.raises(ImportError, match="pip install imageio imageio-ffmpeg"):
+    with pytest.raises(ImportError, match=r"film.mp4 needs imageio_ffmpeg.*\[video\]'; or write a .gif"):
         save(tmp_path / "film.mp4", frames)
 
 

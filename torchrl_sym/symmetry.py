@@ -8,6 +8,7 @@ left un-mirrored is the most common bug of this field.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Literal
 
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from torchrl_sym import checks
+from torchrl_sym import checks, files, printing
 from torchrl_sym.declaration import Declaration, require_even
 from torchrl_sym.entries import PER_ROW as _INVARIANT
 from torchrl_sym.entries import Exchanged, enclosing, split, without_next
@@ -330,6 +331,58 @@ class Symmetry(nn.Module):
                 "add their representations, e.g. invariant(group, d) for what no element changes"
             )
         check_transforms(env, Declared(self.keys(), self, self.group.names))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write this symmetry to one small text that a person can read, and :meth:`load` anywhere.
+
+        It has the group, every key with its representation, and strictness; nothing of the model or the
+        environment that it was found with. A file that is already there is replaced.
+
+        Args:
+            path: the file, such as ``"anymal.json"``.
+
+        Raises:
+            FileNotFoundError: the path is that of a folder, or in none.
+
+        Example:
+            >>> import pathlib, tempfile, torch
+            >>> from torchrl_sym import PointGroup, Symmetry
+            >>> from torchrl_sym.representations import polar
+            >>> group = PointGroup.rotation(3)
+            >>> path = pathlib.Path(tempfile.mkdtemp()) / "robot.json"
+            >>> Symmetry(group, {"action": polar(group)}).save(path)
+            >>> Symmetry.load(path)["action"](torch.tensor([1.0, 0.0, 2.0]), "rot-120")
+            tensor([-0.5000,  0.8660,  2.0000])
+        """
+        files.write(path, self.group, self._declaration.parts, self.strict)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Symmetry:
+        """The symmetry that :meth:`save` wrote, equal to the last bit; it is checked like a new one.
+
+        Raises:
+            FileNotFoundError: there is no such file.
+            ValueError: the file is no symmetry, of a later format, or damaged; the message says where.
+        """
+        group, representations, strict = files.read(path)
+        return Symmetry(group, representations, strict=strict)
+
+    def code(self) -> str:
+        """The declaration of this symmetry as a person would write it: Python, to be pasted and reviewed.
+
+        ``print(symmetry)`` lists every entry instead.
+
+        Example:
+            >>> from torchrl_sym.representations import axial, polar
+            >>> group = PointGroup.reflection("y")
+            >>> text = Symmetry(group, {"velocity": polar(group) + axial(group)}).code()
+            >>> [line.strip() for line in text.splitlines() if "#" in line]
+            ['polar(group)  # 0-2', '+ axial(group)  # 3-5']
+        """
+        return printing.code(self.group, self._declaration.parts, self.strict)
+
+    def __str__(self) -> str:
+        return printing.table(self.group, self._declaration.parts)
 
     def extra_repr(self) -> str:
         return f"{self.group!r}, keys={self.keys()}"

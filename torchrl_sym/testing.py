@@ -156,7 +156,9 @@ def assert_env_symmetric(env: Any, symmetry: Symmetry, **verify_kwargs: Any) -> 
     report = verify(env, symmetry, **verify_kwargs)
     if not report.passed:
         row = report.worst
-        failure = "not symmetric" if report.tested else "not tested, the state decides too little:"
+        if row.passed:
+            raise AssertionError(f"{report.verdict}\n\n{report}")
+        failure = "not symmetric" if report.deterministic else "not tested, the state decides too little:"
         raise AssertionError(
             f"{failure} under {row.element!r}: {row.part} is off by {row.value:.2g} (limit "
             f"{row.limit:.2g}) at {row.where}\n\n{report}"

@@ -1,43 +1,59 @@
-"""Command line: where everything in a model goes, and how exact the symmetry is.
+"""Command line: which symmetries a model has, where everything in it goes, and how exact that is.
 
-python -m torchrl_sym.mujoco robot.xml --group klein_four
+python -m torchrl_sym.mujoco robot.xml
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
+
+from torchrl_sym.extras import require
+
+try:
+    require("python -m torchrl_sym.mujoco", "mujoco", {"tyro": ""})
+except ImportError as error:
+    sys.exit(str(error))
 
 import tyro
 
 from torchrl_sym import checks
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.audit import audit
+from torchrl_sym.mujoco.audit import AuditReport, audit
 from torchrl_sym.mujoco.derive import derive
+from torchrl_sym.mujoco.model.files import load_spec
 from torchrl_sym.mujoco.model.types import mj
+from torchrl_sym.mujoco.symmetries import symmetries
 from torchrl_sym.mujoco.symmetrize import symmetrize_with_report
 
-GROUPS = {
-    "reflect-x": lambda: PointGroup.reflection("x"),
-    "reflect-y": lambda: PointGroup.reflection("y"),
-    "klein_four": PointGroup.klein_four,
-}
+GROUPS = {"klein_four": PointGroup.klein_four}
+_SYMMETRIC = ("exact", "approximate")
 
 
 @dataclass
 class Arguments:
-    """Derive and audit the symmetry of a MuJoCo model; exit status 1 if it has none."""
+    """Which symmetries a MuJoCo model has; exit status 1 if it has none, 2 for a mistake in the call."""
 
     model: Annotated[Path, tyro.conf.Positional]
     """An MJCF or URDF file."""
-    group: str = "reflect-y"
-    """reflect-x, reflect-y (left and right), klein_four, rotation-N or dihedral-N."""
+    group: str | None = None
+    """Try this group only: reflect-x (front and back), reflect-y (left and right), reflect-30 (the angle of
+    the mirror's normal from x, in degrees), klein_four, rotation-N or dihedral-N. Default: try all."""
+    plane: float = 0.0
+    """Degrees by which the mirror planes of --group are turned about the vertical axis."""
     keyframe: str | None = None
-    """A pose that the group keeps, by name; the model's reference pose by default."""
+    """A pose that the group keeps, by name; found by default."""
+    axis: tuple[float, float] | None = None
+    """Where the vertical axis stands, x and y in metres; found by default."""
+    tolerance: float = 1e-8
+    """Largest residual that counts as exact."""
     carried: tuple[str, ...] = ()
     """Free or mocap bodies that a turn of the world only carries along, such as a cube under rotation-3."""
+    free_base: bool = False
+    """Set the base free first: a URDF, or a robot whose free joint is in another file."""
     out: Path | None = None
     """Where to write the model with everything averaged over the group (MJCF, six digits)."""
 
@@ -52,35 +68,76 @@ def named_group(name: str) -> PointGroup:
         >>> named_group("rotation-3").names
         ('identity', 'rot-120', 'rot-240')
     """
-    kind, _, fold = checks.instance("group", name, str).partition("-")
+    kind, _, rest = checks.instance("group", name, str).partition("-")
     if name in GROUPS:
         return GROUPS[name]()
-    if kind in ("rotation", "dihedral") and fold.isdecimal():
-        return getattr(PointGroup, kind)(int(fold))
-    raise ValueError(f"expected one of {list(GROUPS)}, rotation-N or dihedral-N, got {name!r}")
+    if kind in ("rotation", "dihedral") and rest.isdecimal():
+        return getattr(PointGroup, kind)(int(rest))
+    if kind == "reflect" and rest in ("x", "y"):
+        return PointGroup.reflection(rest)
+    try:
+        return PointGroup.reflection(float(rest if kind == "reflect" else "none"))
+    except ValueError as error:
+        known = ["reflect-x", "reflect-y", *GROUPS]
+        raise ValueError(
+            f"expected one of {known}, reflect-DEGREES, rotation-N or dihedral-N, got {name!r}"
+        ) from error
 
 
 def main(arguments: Arguments) -> int:
-    """Print the tables; returns the exit status."""
-    group = named_group(arguments.group)
-    model = mj.MjModel.from_xml_path(str(arguments.model))
-    pose, carried = arguments.keyframe, arguments.carried
-    report = audit(model, group, pose, carried=carried)
+    """Print what was found; returns the exit status."""
     try:
-        tables = f"{derive(model, group, pose, carried=carried)}\n\n"
-    except ValueError:  # the report says why
-        tables = ""
-    sys.stdout.write(f"{tables}{report}\n")
-    if arguments.out is not None and report.reason is None:
-        spec = mj.MjSpec.from_file(str(arguments.model))
-        spec, changes = symmetrize_with_report(spec, group, pose, carried=carried)
-        arguments.out.write_text(spec.to_xml())
-        written = audit(mj.MjModel.from_xml_path(str(arguments.out)), group, pose, carried=carried)
-        sys.stdout.write(
-            f"\n{changes}\n\nwritten to {arguments.out}: {written.verdict}\n"
-            "(MJCF is written with six digits; for an exact model compile what symmetrize returns)\n"
-        )
-    return 0 if report.reason is None else 1
+        for text in _answers(arguments):
+            sys.stdout.write(f"{text}\n")
+    except _NoSymmetry:
+        return 1
+    except (KeyError, OSError, TypeError, ValueError) as error:
+        reason = error.args[0] if isinstance(error, KeyError) else error
+        sys.stderr.write(f"error: {' '.join(str(reason).split())}\n")
+        return 2
+    return 0
+
+
+class _NoSymmetry(Exception):
+    """The model lacks the group; the report, printed before, says why."""
+
+
+def _answers(arguments: Arguments) -> Iterator[str]:
+    spec = load_spec(arguments.model, arguments.free_base)
+    model = spec.compile()
+    where: dict[str, Any] = {"axis": arguments.axis, "carried": arguments.carried}
+    if arguments.group is None:
+        found = symmetries(model, arguments.keyframe, tolerance=arguments.tolerance, **where)
+        yield f"{found}\n"
+        group, report = found.group, found.audit
+        if group.order == 1:
+            raise _NoSymmetry
+    else:
+        group = named_group(arguments.group).turned(arguments.plane)
+        report = audit(model, group, arguments.keyframe, tolerance=arguments.tolerance, **where)
+
+    if report.outcome in _SYMMETRIC:
+        yield f"{derive(model, group, arguments.keyframe, **where)}\n"
+    yield str(report)
+    if report.outcome not in _SYMMETRIC:
+        if arguments.out is not None:
+            yield f"\n{arguments.out} was not written: there is no symmetry to average over"
+        raise _NoSymmetry
+    if arguments.out is not None:
+        yield _write(arguments, spec, group, where)
+
+
+def _write(arguments: Arguments, spec: Any, group: PointGroup, where: dict[str, Any]) -> str:
+    assert arguments.out is not None
+    spec, changes = symmetrize_with_report(spec, group, arguments.keyframe, **where)
+    spec.compile()
+    arguments.out.write_text(spec.to_xml())
+    model = mj.MjModel.from_xml_path(str(arguments.out))
+    written: AuditReport = audit(model, group, arguments.keyframe, tolerance=arguments.tolerance, **where)
+    return (
+        f"\n{changes}\n\nwritten to {arguments.out}: {written.verdict}\n"
+        "(MJCF is written with six digits; for an exact model compile what symmetrize returns)"
+    )
 
 
 if __name__ == "__main__":

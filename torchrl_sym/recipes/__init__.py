@@ -1,5 +1,9 @@
 """Training recipes: PPO with symmetry as one linear loop."""
 
+from torchrl_sym.extras import require
+
+require("torchrl_sym.recipes", "train", {"tqdm": ""})
+
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.export import export_policy
 from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics

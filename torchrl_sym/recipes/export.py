@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_sym import checks
+from torchrl_sym.extras import require
 from torchrl_sym.mirror_loss import check_network, deterministic_action
 from torchrl_sym.recipes.runs import load_actor
 from torchrl_sym.symmetry import Symmetry
@@ -69,7 +70,7 @@ def export_policy(
     if path.suffix not in FORMATS:
         raise ValueError(f"path: expected a file that ends in one of {list(FORMATS)}, got {path.name!r}")
     if path.suffix == ".onnx":
-        _require_onnx()
+        require("an .onnx file", "onnx", {"onnx": "", "onnxscript": ""}, "a .pt2 file needs none")
     checks.instance("env", env, EnvBase)
     if isinstance(source, str | os.PathLike):
         if symmetry is None:
@@ -161,14 +162,3 @@ def _made_by_transforms(env: EnvBase) -> set[NestedKey]:
 
 def _names(keys: list[NestedKey]) -> list[str]:
     return ["_".join(map(str, key)) if isinstance(key, tuple) else str(key) for key in keys]
-
-
-def _require_onnx() -> None:
-    try:
-        import onnx  # noqa: F401  # pyright: ignore[reportMissingImports]
-        import onnxscript  # noqa: F401  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            "an .onnx file needs the packages onnx and onnxscript: pip install 'torchrl_sym[onnx]'; a .pt2 "
-            "file needs none"
-        ) from error

@@ -22,6 +22,7 @@ from typing import IO, Any, cast
 import torch
 from torchrl.record.loggers import Logger, get_logger
 
+from torchrl_sym.extras import require
 from torchrl_sym.recipes.table import MetricsTable, replace_file
 
 _KEYS = {"config", "iteration", "seconds", "parts"}  # of every checkpoint, also of an exported policy
@@ -154,9 +155,11 @@ def _foreign(name: str, value: Any) -> set[str]:
 
 
 def require_logger(kind: str | None) -> None:
-    """ValueError unless there is such a logger."""
+    """ValueError unless there is such a logger; ImportError without the package of it."""
     if kind not in (None, "csv", "tensorboard", "wandb"):
         raise ValueError(f"expected logger 'csv', 'tensorboard' or 'wandb', got {kind!r}")
+    if kind in ("tensorboard", "wandb"):
+        require(f"logger {kind!r}", kind, {kind: ""})
 
 
 def make_logger(kind: str | None, folder: str | os.PathLike | None, name: str) -> Logger | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_sym.mujoco.audit.comparison import Comparison, column_scale
+from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.derive.images import Image
 from torchrl_sym.mujoco.model.types import mj, name_of
 
@@ -16,8 +17,13 @@ _PLAIN_BIASES = (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE))
 def compare_actuators(c: Comparison) -> None:
     """Types, gains, gears, ranges and losses."""
     model = c.model
+    for a, reason in c.action.refusals.items():
+        c.untold.append(f"actuator {name_of(model, 'actuator', a)!r}: {reason}")
     for a, image in c.action.actuators.items():
         b, sign, name = image.index, image.sign, c.name("actuator", a, image.index)
+        c.add("transmission", image.misfit, name)
+        if image.through:  # a constraint gives way a little
+            c.add("transmission", DISCRETE, f"{name} (through equality {image.through})")
         kinds = ("gaintype", "biastype", "dyntype")
         same = all(getattr(model, f"actuator_{k}")[a] == getattr(model, f"actuator_{k}")[b] for k in kinds)
         c.add("actuator type", float(not same), name)
@@ -35,9 +41,12 @@ def compare_actuators(c: Comparison) -> None:
         for term, field, limited, shift in (
             ("ctrlrange", "actuator_ctrlrange", "actuator_ctrllimited", image.offset),
             ("forcerange", "actuator_forcerange", "actuator_forcelimited", 0.0),
-            ("actrange", "actuator_actrange", "actuator_actlimited", image.offset),
+            ("actrange", "actuator_actrange", "actuator_actlimited", image.state_offset),
         ):
-            c.range(term, field, limited, a, b, sign, shift, name)
+            if not image.mixture:
+                c.range(term, field, limited, a, b, sign, shift, name)
+            elif getattr(model, limited)[a]:
+                c.add(term, 1.0, f"{name} (a box, which the element turns)")
 
 
 def _gains(c: Comparison, a: int, image: Image, name: str) -> None:

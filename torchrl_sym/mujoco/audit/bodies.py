@@ -21,12 +21,24 @@ def compare_links(c: Comparison) -> None:
         c.add("mass", abs(one.mass - other.mass) / total, name)
         if min(one.mass, other.mass) > 0:
             offset = float(np.linalg.norm(turn @ one.com - other.com))
-            c.add("centre of mass", offset / c.matcher.extent, name)
+            c.add("centre of mass", offset / c.matcher.extent, name, amount=f"{1e3 * offset:.2g} mm")
+        quaternions = [
+            float(np.abs(np.linalg.norm(model.body_quat[x.bodies], axis=1) - 1).max()) for x in (one, other)
+        ]
+        c.add("body rotation", abs(quaternions[0] - quaternions[1]), name)
         image = turn @ one.inertia @ turn.T
         c.add("inertia", float(np.abs(image - other.inertia).max()) / largest, name)
         if model.body_gravcomp.any():
             lift = [model.body_mass[x.bodies] @ model.body_gravcomp[x.bodies] for x in (one, other)]
             c.add("gravity compensation", abs(float(lift[0] - lift[1])) / total, name)
+
+
+def compare_gravity(c: Comparison) -> None:
+    """A small tilt, relative to gravity itself."""
+    gravity = c.model.opt.gravity
+    if gravity.any():
+        tilt = float(np.linalg.norm(c.matcher.matrix @ gravity - gravity) / np.linalg.norm(gravity))
+        c.add("gravity", tilt if tilt > 1e-15 else 0.0, "gravity", amount=f"{np.degrees(tilt):.2g} deg")
 
 
 def compare_fluid(c: Comparison) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sym.mujoco.audit.report import Kind, Residual
+from torchrl_sym.mujoco.audit.scales import Efforts
 from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
 from torchrl_sym.mujoco.model.links import links_of
 from torchrl_sym.mujoco.model.types import Array, name_of
@@ -13,20 +15,23 @@ from torchrl_sym.mujoco.model.types import Array, name_of
 class Comparison:
     """Compares everything in a model with its image under one element; ``worst`` holds the outcome."""
 
-    def __init__(self, symmetry: ModelSymmetry, g: int) -> None:
+    def __init__(self, symmetry: ModelSymmetry, g: int, efforts: Efforts) -> None:
         self.model, self.action = symmetry.model, symmetry.actions[g]
         self.matcher = self.action.matcher
         self.data, self.image = self.matcher.data, self.matcher.image
         self.links = self.matcher.links
         self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
-        self.worst: dict[str, tuple[float, str]] = {}
+        self.element, self.efforts = symmetry.group.names[g], efforts
+        self.worst: dict[str, Residual] = {}
         self.unchecked: list[str] = []
+        self.untold: list[str] = []
+        self.warnings: list[str] = []
 
-    def add(self, term: str, residual: float, name: str) -> None:
+    def add(self, term: str, residual: float, name: str, kind: Kind = "dynamics", amount: str = "") -> None:
         """Keep the worst part of each term."""
-        if term not in self.worst or residual > self.worst[term][0]:
-            self.worst[term] = (residual, name)
+        if term not in self.worst or residual > self.worst[term].residual:
+            self.worst[term] = Residual(self.element, term, residual, name, kind, amount)
 
     def name(self, kind: str, a: int, b: int) -> str:
         name = name_of(self.model, kind, a)
@@ -59,7 +64,7 @@ class Comparison:
     ) -> None:
         """Model fields that must be equal, relative to the largest among elements of like units."""
         for field in fields:
-            values = np.asarray(getattr(self.model, field), dtype=float)
+            values = np.asarray(getattr(self.model, field, 0.0), dtype=float)  # some are new in 3.17
             if not values.any():
                 continue
             self.values(term, values.reshape(len(values), -1), i, j, name, alike)

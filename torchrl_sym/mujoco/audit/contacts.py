@@ -13,10 +13,15 @@ routine; no simulation stays in them.
 
 from __future__ import annotations
 
+import itertools
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+
 import numpy as np
 
-from torchrl_sym.mujoco.model.shapes import touching
-from torchrl_sym.mujoco.model.types import MjModel, mj, name_of
+from torchrl_sym.mujoco.model.filters import Filters, geom_label
+from torchrl_sym.mujoco.model.shapes import MESH
+from torchrl_sym.mujoco.model.types import MjModel, mj
 
 _GEOM, _DISABLE = mj.mjtGeom, mj.mjtDisableBit
 _KINDS = {
@@ -42,33 +47,6 @@ _APART = 0.3  # and only those so far from the first, in bounding radii
 _NAMED = 2  # pairs of geoms that are named for each pair of kinds
 
 
-def colliding_geoms(model: MjModel) -> list[tuple[int, int]]:
-    """Pairs of geoms between which MuJoCo looks for contacts: by bits, bodies, excludes and explicit pairs.
-
-    Example:
-        >>> model = mj.MjModel.from_xml_string('''<mujoco><worldbody>
-        ...   <geom type="plane" size="1 1 1"/><geom type="box" size="1 1 .1"/>
-        ...   <body><freejoint/><geom size=".1"/></body></worldbody></mujoco>''')
-        >>> colliding_geoms(model)
-        [(0, 2), (1, 2)]
-    """
-    if model.opt.disableflags & int(_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
-        return []
-    body = model.geom_bodyid
-    link = model.body_weldid[body]
-    moves = model.body_dofnum[link] > 0
-    found = touching(model) & (moves[:, None] | moves)
-    if not model.opt.disableflags & int(_DISABLE.mjDSBL_FILTERPARENT):
-        parent = model.body_weldid[model.body_parentid[link]]
-        child = (parent[:, None] == link) & (link[:, None] != 0) & (link != 0)
-        found &= ~(child | child.T)
-    for signature in np.asarray(model.exclude_signature):
-        one, other = body == signature >> 16, body == signature & 0xFFFF
-        found &= ~(np.outer(one, other) | np.outer(other, one))
-    found[model.pair_geom1, model.pair_geom2] = found[model.pair_geom2, model.pair_geom1] = True
-    return [(int(a), int(b)) for a, b in np.argwhere(np.triu(found))]
-
-
 def contact_warnings(model: MjModel) -> tuple[str, ...]:
     """A sentence on the pairs of geoms whose contacts are not mirrored, if there are any.
 
@@ -80,21 +58,47 @@ def contact_warnings(model: MjModel) -> tuple[str, ...]:
         >>> contact_warnings(model)[0].split(":")[0]
         'contacts of cylinder with box (foot and floor) are not mirrored'
     """
-    kinds: dict[tuple[str, str], list[str]] = {}
-    for pair in colliding_geoms(model):
-        first, second = sorted(pair, key=lambda g: int(model.geom_type[g]))
-        if not _is_mirrored(model, first, second):
-            names = (name_of(model, "geom", g) for g in (first, second))
-            key = _kind(model, first), _kind(model, second)
-            kinds.setdefault(key, []).append(" and ".join(names))
-    if not kinds:
+    found: dict[tuple[str, str], list[tuple[int, int]]] = defaultdict(list)
+    counts: Counter[tuple[str, str]] = Counter()
+    for pairs, count in _unmirrored(model):
+        first, second = pairs[0]
+        key = _kind(model, first), _kind(model, second)
+        found[key] += pairs
+        counts[key] += count
+    if not found:
         return ()
-    listed = ", ".join(f"{a} with {b} ({_shown(names)})" for (a, b), names in sorted(kinds.items()))
+    listed = ", ".join(
+        f"{one} with {other} ({_shown(model, pairs, counts[one, other])})"
+        for (one, other), pairs in sorted(found.items())
+    )
     return (
         f"contacts of {listed} are not mirrored: MuJoCo finds them by iteration, or keeps a few points of "
         "many, and a mirrored state may move differently; use spheres, capsules and boxes there, or keep "
         "these geoms from meeting (contype and conaffinity, exclude)",
     )
+
+
+def _unmirrored(model: MjModel) -> Iterator[tuple[list[tuple[int, int]], int]]:
+    """Sets of like pairs of geoms whose contacts are not mirrored: the first few, and how many."""
+    filters, kinds = Filters(model), model.geom_type
+    cornered = np.zeros(model.ngeom, dtype=int)
+    for g in np.flatnonzero(filters.may.any(axis=1)[filters.of] & (kinds == MESH)):
+        cornered[g] = _has_many_cornered_face(model, int(g))
+    keys = np.stack([filters.of, kinds, cornered], axis=1)
+    alike, starts, labels = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(labels.reshape(-1), kind="stable")  # some versions of numpy add a dimension
+    members = np.split(order, np.cumsum(np.bincount(labels.reshape(-1)))[:-1])
+
+    for i, j in np.argwhere(np.triu(filters.may[np.ix_(alike[:, 0], alike[:, 0])])):
+        one, other = sorted((i, j), key=lambda k: (alike[k, 1], starts[k]))
+        if not _is_mirrored(model, int(starts[one]), int(starts[other])):
+            some = itertools.islice(itertools.product(members[one], members[other]), _NAMED)
+            yield [(int(a), int(b)) for a, b in some], len(members[one]) * len(members[other])
+    for pair in sorted(filters.pairs):
+        first, second = sorted(pair, key=lambda g: int(kinds[g]))
+        known = filters.may[filters.of[first], filters.of[second]]
+        if not known and not _is_mirrored(model, first, second):
+            yield [(first, second)], 1
 
 
 def _is_mirrored(model: MjModel, first: int, second: int) -> bool:
@@ -124,6 +128,6 @@ def _kind(model: MjModel, geom: int) -> str:
     return _KINDS[int(model.geom_type[geom])]
 
 
-def _shown(names: list[str]) -> str:
-    more = f", {len(names) - _NAMED} more" * (len(names) > _NAMED)
-    return ", ".join(names[:_NAMED]) + more
+def _shown(model: MjModel, pairs: list[tuple[int, int]], count: int) -> str:
+    names = (" and ".join(geom_label(model, g) for g in pair) for pair in sorted(pairs)[:_NAMED])
+    return ", ".join(names) + f", {count - _NAMED} more" * (count > _NAMED)

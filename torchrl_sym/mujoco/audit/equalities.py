@@ -1,87 +1,157 @@
-"""Equality constraints: is the image of one a constraint of the model?"""
+"""Equality constraints: is the image of one a constraint of the model?
+
+A constraint may be written in several ways. A linear one between two joints, q1 = a + b q2, is also
+q2 = (q1 - a) / b; one between two bodies may name them in either order; and several `connect`s of the same
+two bodies close a hinge, whatever points of its axis they are put at.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from torchrl_sym.mujoco.audit.comparison import Comparison
-from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
+from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.derive.images import Image
-from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
-from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, mj, name_of
+from torchrl_sym.mujoco.model.types import HINGE, Array, MjData, MjModel, mj, name_of
 
 _OBJECT = mj.mjtObj
 _EQ = mj.mjtEq
-_WELD, _JOINT, _TENDON = int(_EQ.mjEQ_WELD), int(_EQ.mjEQ_JOINT), int(_EQ.mjEQ_TENDON)
-EQUALITIES = (int(_EQ.mjEQ_CONNECT), _WELD, _JOINT, _TENDON)  # the kinds that are compared
+_CONNECT, _WELD, _JOINT, _TENDON = (
+    int(kind) for kind in (_EQ.mjEQ_CONNECT, _EQ.mjEQ_WELD, _EQ.mjEQ_JOINT, _EQ.mjEQ_TENDON)
+)
+EQUALITIES = (_CONNECT, _WELD, _JOINT, _TENDON)  # the kinds that are compared
 
 
 def compare_equalities(c: Comparison) -> None:
     """Which constraint is the image of each, and how far off."""
-    model = c.model
+    model, constraints = c.model, _Constraints(c)
     for e in range(model.neq):
         label = name_of(model, "equality", e)
         if int(model.eq_type[e]) not in EQUALITIES:
             c.unchecked.append(f"equality constraint {label!r}, of an unsupported kind")
             continue
-        tendons = c.action.tendons
-        fits = [
-            (
-                equality_residual(model, c.data, c.matcher, c.map, tendons, e, f),
-                f != e,
-                f,
-            )
-            for f in range(model.neq)
-        ]
-        residual, _, f = min(fits)
+        residual, _, f = min((constraints.residual(e, f), f != e, f) for f in range(model.neq))
         name = c.name("equality", e, f) if residual < 1 else f"{label} (no image)"
         c.add("equality constraints", residual, name)
         if residual < 1:
             c.fields("equality constraints", ["eq_solref", "eq_solimp", "eq_active0"], e, f, name)
 
 
-def equality_residual(
-    model: MjModel,
-    data: MjData,
-    matcher: Matcher,
-    map_: CoordinateMap,
-    tendons: dict[int, Image],
-    e: int,
-    f: int,
-) -> float:
-    """How far the image of equality constraint e is from constraint f; 1 if they bind other parts."""
-    if model.eq_type[e] != model.eq_type[f] or model.eq_objtype[e] != model.eq_objtype[f]:
-        return 1.0
-    kind = int(model.eq_type[e])
-    mine, theirs = ([int(x) for x in (model.eq_obj1id[k], model.eq_obj2id[k])] for k in (e, f))  # -1: none
-    if kind in (_JOINT, _TENDON):
-        if kind == _JOINT:
-            images = {j: Image(k, map_.signs.get(j, 1.0)) for j, k in map_.joints.items()}
-        else:
-            images = tendons
-        moved = [images[x] if x >= 0 else Image(-1) for x in mine]
-        if [image.index for image in moved] != theirs:
+@dataclass
+class _Constraints:
+    """Compares one constraint's image with another."""
+
+    c: Comparison
+    ends: dict[int, tuple[list[int], Array, Array]] = field(default_factory=dict)
+    images: dict[int, tuple[list[int], Array, Array]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        model = self.c.model
+        for e in range(model.neq):
+            if int(model.eq_type[e]) in (_CONNECT, _WELD):
+                self.ends[e] = _ends(model, self.c.data, e)
+                self.images[e] = _ends(model, self.c.image, e)
+
+    def residual(self, e: int, f: int) -> float:
+        """How far the image of constraint e is from constraint f; 1 if they bind other parts."""
+        model = self.c.model
+        if model.eq_type[e] != model.eq_type[f] or model.eq_objtype[e] != model.eq_objtype[f]:
             return 1.0
-        powers = moved[0].sign * moved[1].sign ** np.arange(5)
-        gap = np.abs(powers * model.eq_data[e, :5] - model.eq_data[f, :5]).max()
-        for i, j in zip(mine, theirs, strict=True) if kind == _JOINT else ():
-            if i >= 0:  # the polynomial is about qpos0
-                q, r = model.qpos0[model.jnt_qposadr[[i, j]]]
-                gap = max(gap, abs(map_.signs[i] * q + map_.offsets[i] - r))
-        return min(float(gap), 1.0)
-    turn = matcher.matrix
-    owners, points, rotation = _ends(model, data, e)
-    owners_f, points_f, rotation_f = _ends(model, matcher.image, f)
-    worst = 1.0
-    for order in ([0, 1], [1, 0]):
-        if [map_.bodies[owners[k]] for k in order] == owners_f:
-            gap = np.linalg.norm(points[order] @ turn.T - points_f, axis=1).max() / matcher.extent
-            aligned = rotation if order == [0, 1] else rotation.T
-            gap = max(gap, np.abs(turn @ aligned @ turn.T - rotation_f).max())
-            gap = max(gap, abs(model.eq_data[e, 10] - model.eq_data[f, 10]) * (kind == _WELD))
-            worst = min(worst, float(gap))
-    return worst
+        if int(model.eq_type[e]) in (_JOINT, _TENDON):
+            return self._polynomial(e, f)
+        return self._bodies(e, f)
+
+    def _polynomial(self, e: int, f: int) -> float:
+        """Coordinates y = p(x) of joints or tendons, about their reference positions."""
+        model, is_joint = self.c.model, int(self.c.model.eq_type[e]) == _JOINT
+        signs, joints = self.c.map.signs, self.c.map.joints
+        images = (
+            {j: Image(k, signs.get(j, 1.0)) for j, k in joints.items()}
+            if is_joint
+            else self.c.action.tendons
+        )
+        mine, theirs = (
+            [int(x) for x in (model.eq_obj1id[k], model.eq_obj2id[k])] for k in (e, f)
+        )  # -1: none
+        if any(x >= 0 and x not in images for x in mine) or (
+            is_joint and any(x >= 0 and x not in signs for x in mine)
+        ):
+            return 1.0
+        moved = [images[x] if x >= 0 else Image(-1) for x in mine]
+        worst = 1.0
+        for ends, powers in _ways_to_write(theirs, model.eq_data[f, :5]):
+            if [image.index for image in moved] == ends:
+                image = moved[0].sign * moved[1].sign ** np.arange(5) * model.eq_data[e, :5]
+                gap = np.abs(image - powers).max()
+                for i, j in zip(mine, ends, strict=True) if is_joint else ():
+                    if i >= 0:  # the polynomial is about qpos0
+                        q, r = model.qpos0[model.jnt_qposadr[[i, j]]]
+                        gap = max(gap, abs(signs[i] * q + self.c.map.offsets[i] - r))
+                worst = min(worst, float(gap))
+        return worst
+
+    def _bodies(self, e: int, f: int) -> float:
+        """Points that a connect or weld joins, and the rotation that a weld asks for."""
+        c, weld = self.c, int(self.c.model.eq_type[e]) == _WELD
+        (owners, points, turned), (owners_f, points_f, turned_f) = self.ends[e], self.images[f]
+        turn, worst, idle = c.matcher.matrix, 1.0, self._idle(owners_f)
+        for order in ([0, 1], [1, 0]):
+            if [c.map.bodies[owners[k]] for k in order] == owners_f:
+                gaps = points[order] @ turn.T - points_f
+                apart = np.linalg.norm(gaps, axis=1).max()
+                if not weld and idle is not None:  # a constraint along the axis of all hinges does nothing
+                    gaps = gaps - np.outer(gaps @ idle, idle)
+                    apart = max(np.linalg.norm(gaps, axis=1).max(), min(apart, DISCRETE * c.matcher.extent))
+                beside = apart if weld else min(apart, self._beside(points[order] @ turn.T, f))
+                gap = max(beside, min(apart, DISCRETE * c.matcher.extent)) / c.matcher.extent
+                aligned = turned if order == [0, 1] else turned.T
+                gap = max(gap, np.abs(turn @ aligned @ turn.T - turned_f).max())
+                gap = max(gap, abs(c.model.eq_data[e, 10] - c.model.eq_data[f, 10]) * weld)
+                worst = min(worst, float(gap))
+        return worst
+
+    def _idle(self, owners: list[int]) -> Array | None:
+        """The axis of a planar linkage: of all hinges between two links, if they are parallel."""
+        model, chains = self.c.model, []
+        for link in owners:
+            chain = []
+            while link:
+                chain.append(link)
+                link = int(weld_ids(model)[model.body_parentid[link]])
+            chains.append(chain)
+        between = set(chains[0]) ^ set(chains[1])
+        joints = np.flatnonzero(np.isin(model.jnt_bodyid, list(between)))
+        axes = self.c.image.xaxis[joints]
+        hinges = (model.jnt_type[joints] == HINGE).all()
+        parallel = len(joints) > 0 and np.abs(np.cross(axes, axes[0])).max() < 1e-6
+        return axes[0] if hinges and parallel else None
+
+    def _beside(self, points: Array, f: int) -> float:
+        """Distance of points from the hinge axis that f and others of its bodies close, if they do."""
+        owners = sorted(self.images[f][0])
+        same = [
+            k
+            for k, (others, _, _) in self.images.items()
+            if sorted(others) == owners and int(self.c.model.eq_type[k]) == _CONNECT
+        ]
+        on_axis = np.array([self.images[k][1].mean(axis=0) for k in same])
+        direction = on_axis[int(np.linalg.norm(on_axis - on_axis[0], axis=1).argmax())] - on_axis[0]
+        if np.linalg.norm(direction) < 1e-3 * self.c.matcher.extent:
+            return np.inf
+        direction /= np.linalg.norm(direction)
+        return float(np.linalg.norm(np.cross(points - on_axis[0], direction), axis=1).max())
+
+
+def _ways_to_write(ends: list[int], powers: Array) -> list[tuple[list[int], Array]]:
+    """The constraint y = p(x) as it is, and with x and y exchanged if it is linear."""
+    ways = [(ends, powers)]
+    if ends[1] >= 0 and powers[1] != 0.0 and not powers[2:].any():
+        ways.append((ends[::-1], np.array([-powers[0], 1.0, 0.0, 0.0, 0.0]) / powers[1]))
+    return ways
 
 
 def _ends(model: MjModel, data: MjData, e: int) -> tuple[list[int], Array, Array]:
@@ -96,7 +166,7 @@ def _ends(model: MjModel, data: MjData, e: int) -> tuple[list[int], Array, Array
         bodies, frames = np.array([one, other]), data.xmat[[one, other]].reshape(2, 3, 3)
         anchors = [prm[3:6], prm[:3]] if kind == _WELD else [prm[:3], prm[3:6]]
         points = data.xpos[bodies] + np.einsum("kij,kj->ki", frames, np.array(anchors))
-    owners = [int(model.body_weldid[body]) for body in bodies]
+    owners = [int(weld_ids(model)[body]) for body in bodies]
     if kind != _WELD:
         return owners, points, np.eye(3)
     relative = np.eye(3) if by_site else rotation(prm[6:10])

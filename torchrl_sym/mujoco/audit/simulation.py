@@ -11,7 +11,8 @@ import numpy as np
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.audit.contacts import contact_warnings
-from torchrl_sym.mujoco.model.shapes import active_geoms
+from torchrl_sym.mujoco.model.filters import active_geoms
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, MjModel, mj, name_of
 
 _OPAQUE = {
@@ -60,7 +61,7 @@ def simulation_warnings(model: MjModel, group: PointGroup) -> tuple[str, ...]:
 
 def _can_yaw(model: MjModel) -> bool:
     """Whether a body floats in the plane and turns about the vertical axis."""
-    for body in np.flatnonzero((model.body_weldid[model.body_parentid] == 0) & (model.body_jntnum > 0)):
+    for body in np.flatnonzero((weld_ids(model)[model.body_parentid] == 0) & (model.body_jntnum > 0)):
         joints = int(model.body_jntadr[body]) + np.arange(int(model.body_jntnum[body]))
         kinds = model.jnt_type[joints]
         turns = (kinds == BALL) | ((kinds == HINGE) & (np.abs(model.jnt_axis[joints, 2]) > 0.5))
@@ -79,7 +80,5 @@ def unchecked_elements(model: MjModel) -> tuple[str, ...]:
     counts = {"plugins": model.nplugin, "flexes": model.nflex, "skins": model.nskin}
     out += [f"{count} {name}" for name, count in counts.items() if count]
     out += ["surface velocities of geoms"] * bool(np.any(model.geom_surfacevel))
-    polynomials = ("jnt_stiffnesspoly", "dof_dampingpoly", "tendon_stiffnesspoly", "tendon_dampingpoly")
-    out += [f"{field}" for field in polynomials if np.any(getattr(model, field, 0))]
     out += ["actuators with several controls"] * (getattr(model, "nactuator", model.nu) != model.nu)
     return tuple(out)

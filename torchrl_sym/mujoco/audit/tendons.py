@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from torchrl_sym.mujoco.audit.comparison import Comparison
-from torchrl_sym.mujoco.audit.geoms import shape_residual
-from torchrl_sym.mujoco.derive.matching import Matcher
-from torchrl_sym.mujoco.model.types import MjData, MjModel, mj
+from torchrl_sym.mujoco.model.types import mj
 
 
 def compare_tendons(c: Comparison) -> None:
-    """Paths, ranges, springs and losses."""
+    """Paths, coefficients, ranges, springs and losses."""
     model = c.model
     for t, image in c.action.tendons.items():
         u, sign, name = image.index, image.sign, c.name("tendon", t, image.index)
-        first, count = int(model.tendon_adr[t]), int(model.tendon_num[t])
-        shift = 0.0
-        if model.wrap_type[first] == int(mj.mjtWrap.mjWRAP_JOINT):
-            for k in range(first, first + count):
-                joint = int(model.wrap_objid[k])
-                factor = sign * c.map.signs[joint] * float(model.wrap_prm[k])
-                shift += factor * c.map.offsets[joint]
-        else:
-            c.add("tendon path", path_residual(model, c.data, c.matcher, t, u), name)
+        fixed = model.wrap_type[int(model.tendon_adr[t])] == int(mj.mjtWrap.mjWRAP_JOINT)
+        c.add("tendon coefficients" if fixed else "tendon path", image.misfit, name)
+        shift = image.offset
+        if image.mixture:
+            if model.tendon_limited[t] or model.tendon_actfrclimited[t]:
+                c.add("tendon range", 1.0, f"{name} (a box, which the element turns)")
+            continue
         c.range("tendon range", "tendon_range", "tendon_limited", t, u, sign, shift, name)
         c.range("tendon range", "tendon_actfrcrange", "tendon_actfrclimited", t, u, sign, 0.0, name)
         if model.tendon_stiffness[t] > 0:
             c.range("tendon spring", "tendon_lengthspring", None, t, u, sign, shift, name)
         for term, fields in (
-            ("tendon spring", ["stiffness"]),
-            ("tendon damping", ["damping"]),
+            ("tendon spring", ["stiffness", "stiffnesspoly"]),
+            ("tendon damping", ["damping", "dampingpoly"]),
             ("tendon armature", ["armature"]),
             ("tendon frictionloss", ["frictionloss"]),
             (
@@ -39,22 +33,3 @@ def compare_tendons(c: Comparison) -> None:
             ),
         ):
             c.fields(term, [f"tendon_{field}" for field in fields], t, u, name)
-
-
-def path_residual(model: MjModel, data: MjData, matcher: Matcher, t: int, u: int) -> float:
-    """Wrapping geoms and pulleys of spatial tendon t against those of u, in the better direction."""
-    a, b, count = int(model.tendon_adr[t]), int(model.tendon_adr[u]), int(model.tendon_num[t])
-
-    def residual(order: Iterable[int]) -> float:
-        worst = 0.0
-        for k, m in enumerate(order):
-            kind, objects = int(model.wrap_type[a + k]), model.wrap_objid[[a + k, b + m]]
-            if kind != int(model.wrap_type[b + m]):
-                return 1.0
-            if kind in (int(mj.mjtWrap.mjWRAP_SPHERE), int(mj.mjtWrap.mjWRAP_CYLINDER)):
-                worst = max(worst, shape_residual(model, data, matcher, int(objects[0]), int(objects[1])))
-            elif kind == int(mj.mjtWrap.mjWRAP_PULLEY):
-                worst = max(worst, abs(float(model.wrap_prm[a + k] - model.wrap_prm[b + m])))
-        return min(worst, 1.0)
-
-    return min(residual(range(count)), residual(range(count - 1, -1, -1)))

@@ -28,6 +28,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import conjugate, product, rotation, sandwich
 from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, MjData, MjModel
 
@@ -183,7 +184,7 @@ def _mix(out: CoordinateMap, matcher: Matcher, a: int, weights: Array) -> None:
 
 def _frame_owner(model: MjModel, body: int) -> int:
     """The link that a body's parent belongs to."""
-    return int(model.body_weldid[model.body_parentid[body]])
+    return int(weld_ids(model)[model.body_parentid[body]])
 
 
 def _at_zero(data: MjData, model: MjModel, body: int, joint: int) -> Array:

@@ -61,10 +61,10 @@ def derive(
         shapes agree as well is for :func:`~torchrl_sym.mujoco.audit` to say.
 
     Raises:
-        SymmetryError: a link, joint, actuator or tendon has no image in any pose, or a body cannot be
-            carried by an element; the message names it, the nearest candidate and how far off that is.
-        ValueError: the group tilts gravity, or a body that is neither free nor mocap, or that moving
-            bodies hang on, is to be carried.
+        SymmetryError: the group tilts gravity, a link, joint, actuator or tendon has no image in any pose,
+            or a body cannot be carried by an element; the message names it, the nearest candidate and how
+            far off that is.
+        ValueError: a body that is neither free nor mocap, or that moving bodies hang on, is to be carried.
         KeyError: no such keyframe, or no such body to be carried.
 
     Example:
@@ -82,7 +82,7 @@ def derive(
     tolerance = checks.real("tolerance", tolerance, 0.0)
     for name, matrix in zip(check_group(group).names, group.matrices, strict=True):
         if (matrix @ gravity - gravity).norm() > _TILT * gravity.norm():
-            raise ValueError(
+            raise SymmetryError(
                 f"{name!r} tilts gravity {gravity.tolist()}; use a group that fixes the vertical axis, or "
                 "switch gravity off in the model"
             )
@@ -94,7 +94,10 @@ def derive(
         matchers[0].pairing.parts, [(m.matrix, m.images, m.joint_pairs()) for m in matchers]
     )
     actions = [Action(m, map_coordinates(m, slides), tolerance) for m in matchers]
-    return ModelSymmetry(model, group, actions, pose=found.words, ambiguous=found.ambiguous)
+    try:
+        return ModelSymmetry(model, group, actions, pose=found.words, ambiguous=found.ambiguous)
+    except ValueError as error:
+        raise SymmetryError(f"the images of the elements do not make a group: {error}") from error
 
 
 def _checked(axis: tuple[float, float] | None) -> tuple[float, float] | None:

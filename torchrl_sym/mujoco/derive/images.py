@@ -61,11 +61,19 @@ def assign(cost: Array) -> list[tuple[int, int]]:
     """Best pairs; of elements that are alike each goes to its image in order, so that the maps compose."""
     if not cost.size:
         return []
-    rows, columns = (
-        np.tril(np.isclose(c[:, None], c[None], atol=1e-9).all(-1), -1).sum(1) for c in (cost, cost.T)
-    )
+    rows, columns = _ranks(cost), _ranks(cost.T)
     ranked = cost + 1e-8 * np.abs(np.subtract.outer(rows, columns))
     return [(int(r), int(c)) for r, c in zip(*linear_sum_assignment(ranked), strict=True)]
+
+
+def _ranks(rows: Array) -> Array:
+    """How many equal rows come before each."""
+    labels = np.unique(np.round(rows, 9), axis=0, return_inverse=True)[1].reshape(-1)
+    seen, ranks = np.zeros(len(rows), dtype=int), np.zeros(len(rows), dtype=int)
+    for i, label in enumerate(labels):
+        ranks[i] = seen[label]
+        seen[label] += 1
+    return ranks
 
 
 def mixture(target: Array, parts: Mapping[int, Array]) -> dict[int, float]:

@@ -18,6 +18,7 @@ from torchrl_sym.mujoco.derive.names import counterparts, exchanged
 from torchrl_sym.mujoco.derive.pairing import Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.turning import Turning
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, label_of, name_of
 
 _GOOD = 1e-4  # a fit below this, in tolerances, needs no better one
@@ -33,16 +34,30 @@ class Standing:
     images: list[dict[int, int]] = field(default_factory=list)
     words: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
-    misfit: float = 0.0
+    hopeless: bool = False  # whether a tree has joints on its first link without image, in any pose
 
 
 def stand(parts: Parts, group: PointGroup, origin: Array, tolerance: float) -> Standing:
     """Find it for every loose tree of a model at a pose; the group acts about the axis through origin."""
     out = Standing(images=[{} for _ in range(group.order)])
-    turning = Turning(parts, group.matrices.numpy(), tolerance)
+    turning = Turning(parts, group.matrices.numpy(), generators(group), tolerance)
     for alike in _buckets(turning):
         _stand_alike(turning, group, origin, alike, out)
     return out
+
+
+def generators(group: PointGroup) -> list[int]:
+    """A few elements whose products are the group: what fits them fits all."""
+    found, reached = [], {0}
+    for g in range(1, group.order):
+        if g not in reached:
+            found.append(g)
+            while True:
+                more = {int(group.table[a, b]) for a in found for b in reached} - reached
+                if not more:
+                    break
+                reached |= more
+    return found
 
 
 def _stand_alike(
@@ -61,9 +76,9 @@ def _stand_alike(
         names = ", ".join(label_of(model, "body", b) for b in alike)
         out.ambiguous.append(f"{names} are alike: each is taken for its own image")
     for b in alike:
-        misfit, words, turn, point = own[b] if own else _own(turning, b)
+        _, words, turn, point = own[b] if own else _own(turning, b)
+        out.hopeless |= not turning.is_rigid(b) and b not in turning.held
         out.turns[b], out.points[b] = turn, point
-        out.misfit = max(out.misfit, 0.0 if turning.is_rigid(b) else misfit)
         for images in out.images:
             images[b] = b
         if words != "as it is":
@@ -72,7 +87,7 @@ def _stand_alike(
 
 def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
     """Misfit, words, turn and point with which a tree is its own image, the first that is good enough."""
-    elements, zero = range(1, len(turning.matrices)), np.zeros(3)
+    elements, zero = turning.generators, np.zeros(3)
     tried: list[tuple[float, str, Array, Array]] = []
 
     def attempt(by: Turning, words: str, turn: Array, point: Array) -> bool:
@@ -82,16 +97,17 @@ def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
 
     if any(attempt(turning, *usual, zero) for usual in turning.usual(tree)):
         return tried[-1]
-    least = min(tried, key=_misfit)[0]
-    more = turning.more(tree) if turning.is_object(tree) or least > 1 else ()
+    held = tree in turning.held
+    more = turning.more(tree) if turning.is_object(tree) or not held else ()
     if any(attempt(turning, *turn, zero) for turn in more):
         return tried[-1]
-    if min(tried, key=_misfit)[0] > 1:  # the frame may be anywhere in the body
+    if min(tried, key=_misfit)[0] > 1 and not held:  # the frame may be anywhere in the body
         for point in _points(turning, tree):
             about = turning.parts.about({tree: turning.parts.points[tree] + point})
-            by = Turning(about, turning.matrices, turning.tolerance)
+            by = Turning(about, turning.matrices, turning.generators, turning.tolerance)
             if any(attempt(by, *usual, point) for usual in by.usual(tree)):
                 return tried[-1]
+            turning.held |= by.held
         if min(tried, key=_misfit)[0] > 1:
             tried = [t for t in tried if t[3] is zero]
     best = min(tried, key=_misfit)
@@ -113,7 +129,8 @@ def _points(turning: Turning, tree: int) -> list[Array]:
     about = parts.about({tree: parts.points[tree] + mass})
     found = [mass]
     for _, turn in turning.usual(tree):
-        pairings = [Pairing(about, turn.T @ m @ turn, m) for m in turning.matrices[1:]]
+        elements = turning.matrices[turning.generators]
+        pairings = [Pairing(about, turn.T @ m @ turn, m) for m in elements]
         moved = center((p, p.images(tree, tree)) for p in pairings)
         found.append(mass + moved)
     return found[:1] + [p for p in found[1:] if np.isfinite(p).all()]
@@ -137,7 +154,6 @@ def _exchange(
             for a, b in images[g].items()
         )
         if misfit <= 1:
-            out.misfit = max(out.misfit, misfit)
             out.turns |= {b: usual[b][k][1] for b in alike}
             out.points |= dict.fromkeys(alike, np.zeros(3))
             for g, own in enumerate(images):
@@ -170,7 +186,7 @@ def _buckets(turning: Turning) -> list[list[int]]:
 def _reach(parts: Parts, tree: int) -> float:
     """How far a tree's shapes reach from its frame, however it is turned."""
     model = parts.model
-    geoms = np.flatnonzero(np.isin(model.body_weldid[model.geom_bodyid], parts.tree(tree)))
+    geoms = np.flatnonzero(np.isin(weld_ids(model)[model.geom_bodyid], parts.tree(tree)))
     away = np.linalg.norm(parts.data.geom_xpos[geoms] - parts.data.xpos[tree], axis=1)
     return float((away + model.geom_rbound[geoms]).max(initial=0.0))
 

@@ -12,6 +12,7 @@ from torchrl_sym.mujoco.derive.chains import JointPairs
 from torchrl_sym.mujoco.derive.pairing import Misfit, Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.model.poses import shift
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, mj
 
 
@@ -72,7 +73,7 @@ class Matcher:
 
     def size(self, body: int) -> float:
         """Size of the tree of moving links that a body is in: an object's own beside a robot."""
-        return self.pairing.parts.size(int(self.model.body_weldid[body]))
+        return self.pairing.parts.size(int(weld_ids(self.model)[body]))
 
     def misfit(self, tolerance: float) -> Misfit:
         """The worst pair of links or joints; above 1 this is no symmetry."""

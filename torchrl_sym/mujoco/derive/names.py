@@ -25,7 +25,8 @@ def exchanged(matrix: Array) -> tuple[bool, bool]:
     if det < 0:
         normal_along_y = float(matrix[1, 1]) < float(matrix[0, 0])
         return normal_along_y, not normal_along_y
-    return (trace < -1.9,) * 2
+    half = trace < -1.9
+    return half, half
 
 
 def counterparts(name: str, sides: bool, ends: bool) -> list[str]:

@@ -43,9 +43,6 @@ class Misfit:
     one: int = 0
     other: int = 0
 
-    def __str__(self) -> str:
-        return f"{self.kind} {self.one} -> {self.other}: {self.size:.2g}"
-
 
 class Pairing:
     """Finds images under one isometry.
@@ -67,6 +64,7 @@ class Pairing:
         self.total_inertia = max([*inertias, 1e-12])
         self.undecided: dict[tuple[int, int], tuple[int, int]] = {}
         self._names: tuple[bool, bool] | None = None
+        self._costs: dict[tuple[int, int], float] = {}
         self._known: dict[str, dict[str, int]] = {}
         self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}
         self._joints: dict[tuple[int, int], JointPairs] = {}
@@ -125,10 +123,11 @@ class Pairing:
 
     def joint_cost(self, i: int, j: int) -> float:
         """How far joint i's image is from joint j: type, axis up to sign, and anchor."""
-        turn, away = self.joint_gaps(i, j)
-        if not np.isfinite(turn):
-            return _MISFIT
-        return 1 - float(np.cos(turn)) + away / self.parts.size(int(self.model.jnt_bodyid[j]))
+        if (i, j) not in self._costs:
+            turn, away = self.joint_gaps(i, j)
+            size = self.parts.size(int(self.model.jnt_bodyid[j]))
+            self._costs[i, j] = 1 - float(np.cos(turn)) + away / size if np.isfinite(turn) else _MISFIT
+        return self._costs[i, j]
 
     def joint_gaps(self, i: int, j: int) -> tuple[float, float]:
         """Angle (rad) between the axes and distance (m) between the anchors; infinite for other types."""
@@ -150,6 +149,13 @@ class Pairing:
             return turn, 0.0  # a slide's anchor does not matter
         offset = offset - (offset @ axis) * axis  # a hinge's anchor may be anywhere on its axis
         return turn, float(np.sqrt(offset @ offset))
+
+    def holds(self, a: int, b: int, tolerance: float) -> bool:
+        """Whether b is where a should be, and joints on a have images on b: no pose decides that."""
+        if self.center_gap(a, b) > _CENTER * tolerance * self.parts.size(b):
+            return False
+        mine, theirs = ([j for c in self.links[x].children for j in self.links[c].joints] for x in (a, b))
+        return all(any(self.joint_cost(i, j) <= tolerance for j in theirs) for i in mine)
 
     def center_gap(self, a: int, b: int) -> float:
         """Distance (m) of the centre of mass of link a's image from that of b; 0 if one has no mass."""
@@ -273,7 +279,7 @@ class Pairing:
         assert self._names is not None
         cost = _NAME * self._named_otherwise("body", a, b)
         for i, j in joints.items():
-            cost += _NAME * self._named_otherwise("joint", i, j) + _RANGE * self._range_gap(i, j)
+            cost += _NAME * self._named_otherwise("joint", i, j) + _RANGE * self.range_gap(i, j)
         return cost
 
     def _named_otherwise(self, kind: str, a: int, b: int) -> bool:
@@ -288,7 +294,7 @@ class Pairing:
             self._known[kind] = {name_of(self.model, kind, index): index for index in range(count)}
         return self._known[kind]
 
-    def _range_gap(self, i: int, j: int) -> float:
+    def range_gap(self, i: int, j: int) -> float:
         """How far the image of joint i's range is from that of joint j, at most 1."""
         model, kind = self.model, int(self.model.jnt_type[i])
         if kind not in (HINGE, SLIDE) or int(model.jnt_type[j]) != kind:
@@ -334,7 +340,7 @@ class Pairing:
         return (
             f"{label_of(model, 'joint', a)} has no image under {element!r}: the nearest, "
             f"{label_of(model, 'joint', b)}, misses it by {np.degrees(turn):.2g} degrees and "
-            f"{1e3 * away:.2g} mm ({limit})"
+            f"{1e3 * away:.3g} mm ({limit})"
         )
 
     def _explain_order(self, a: int, b: int, element: str) -> str:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from torchrl_sym.mujoco.model.links import Link, is_loose, links_of, sizes_of
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel
 
 
@@ -65,7 +66,7 @@ class Parts:
         for body, link in self.links.items():
             if link.tree in points:
                 shift[body] = points[link.tree] - self.points[link.tree]
-        owners = model.body_weldid[model.jnt_bodyid]
+        owners = weld_ids(model)[model.jnt_bodyid]
         return replace(
             self,
             points={**self.points, **points},

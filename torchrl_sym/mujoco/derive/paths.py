@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.sites import site_gap
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel, label_of, mj
 
 _SITE, _PULLEY, _CYLINDER = (
@@ -41,6 +42,16 @@ def branches(model: MjModel, tendon: int) -> list[Branch]:
         else:
             found[-1].parts.append((kind, number, round(value) if kind != _SITE else -1))
     return [branch for branch in found if branch.parts]
+
+
+def links_of_path(model: MjModel, tendon: int) -> list[tuple[int, int]]:
+    """Kinds of the objects on the path of a spatial tendon, and the links that they are on."""
+    welds = weld_ids(model)
+    return [
+        (kind, int(welds[(model.site_bodyid if kind == _SITE else model.geom_bodyid)[number]]))
+        for branch in branches(model, tendon)
+        for kind, number, _ in branch.parts
+    ]
 
 
 def side_sites(model: MjModel) -> set[int]:
@@ -82,7 +93,7 @@ def _parts_gap(matcher: Matcher, mine: list, theirs: list) -> float:
 def _wrap_gap(matcher: Matcher, a: int, b: int) -> float:
     """How far wrapping geom b is from the image of a: its place, radius and, of a cylinder, axis."""
     model = matcher.model
-    owners = model.body_weldid[model.geom_bodyid[[a, b]]]
+    owners = weld_ids(model)[model.geom_bodyid[[a, b]]]
     if matcher.images.get(int(owners[0])) != int(owners[1]) or model.geom_type[a] != model.geom_type[b]:
         return _MISFIT
     gap, turn = matcher.matrix @ matcher.data.geom_xpos[a] - matcher.image.geom_xpos[b], 0.0
@@ -105,7 +116,7 @@ def side_gap(matcher: Matcher, one: tuple[int, int, int], other: tuple[int, int,
     if one[2] < 0:
         return 0.0
     model = matcher.model
-    owners = model.body_weldid[model.site_bodyid[[one[2], other[2]]]]
+    owners = weld_ids(model)[model.site_bodyid[[one[2], other[2]]]]
     if matcher.images.get(int(owners[0])) != int(owners[1]):
         return _MISFIT
     arms, insides = [], []

@@ -1,9 +1,9 @@
 """Looks for a pose, an axis and a stand of the free bodies that a group keeps.
 
-The pose is the first that fits of those the model has (qpos0, keyframes, zeros, middles of ranges), or else
-one that is solved for. What fits nearly is made to fit: a keyframe that is symmetric to 1e-3 would leave
-every joint with an offset of 1e-3, so that the pose is averaged over the group, with small offsets taken
-for none, if the robot fits there as well.
+The pose is the first that fits of those the model has (qpos0, keyframes, zeros, middles of ranges), or one
+that is solved for; one that only nearly fits gives way to a later one that clearly does. What fits nearly
+is made to fit: a keyframe that is symmetric to 1e-3 would leave every joint with an offset of 1e-3, so that
+the pose is averaged over the group, with small offsets taken for none, if the robot fits there as well.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.axis import find_axis
 from torchrl_sym.mujoco.derive.images import SymmetryError
-from torchrl_sym.mujoco.derive.loose import Standing, stand
+from torchrl_sym.mujoco.derive.loose import Standing, generators, stand
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.solving import solved
@@ -25,6 +25,9 @@ from torchrl_sym.mujoco.model.rotations import quaternion
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjModel, label_of
 
 _SNAP = 1e-2  # offsets below it (rad, or relative to a tree's size) are none, if the robot fits as well
+_CLOSE = 0.1  # a pose that fits so well (of what is tolerated) is taken without a look at others
+_CLEARLY = 0.1  # another pose, or offsets that the ranges say, must fit so much better than the first
+_RANGE = 0.1  # of their width, by which ranges may differ at a pose that was solved for
 
 
 @dataclass
@@ -83,23 +86,28 @@ class Search:
             SymmetryError: none does; the message names what is nearest to fit, and the poses tried.
             KeyError: no such keyframe.
         """
-        tried = []
+        tried: list[Stance] = []
         for pose in poses(self.model, keyframe):
             tried.append(self._at(pose))
-            if tried[-1].misfit <= 1:
+            if tried[-1].misfit <= _CLOSE:
                 return self._settled(tried[-1])
+            if tried[-1].standing.hopeless:
+                break
+        if keyframe is None and not tried[-1].standing.hopeless:
+            start = tried[0]
+            pose = solved(self.model, self.group, start.pose, start.axis, self.carried, self.tolerance)
+            if pose is not None and self._in_range(stance := self._at(pose)):
+                tried.append(stance)
         best = min(tried, key=lambda stance: stance.misfit)
-        if keyframe is None and np.isfinite(best.misfit):
-            pose = solved(self.model, self.group, tried[0].pose, tried[0].axis, self.carried)
-            tried.append(self._at(pose))
-            if tried[-1].misfit <= 1:
-                return self._settled(tried[-1])
-        self._refuse(tried)
+        if best.misfit > 1:
+            self._refuse(tried)
+        first = next(stance for stance in tried if stance.misfit <= 1)
+        return self._settled(best if best.misfit <= _CLEARLY * first.misfit else first)
 
     def _at(self, pose: Pose) -> Stance:
         model, parts = self.model, Parts.of(self.model, kinematics(self.model, pose), self.carried)
         if self.axis is None:
-            axis = find_axis(parts, self.matrices[1:], self.tolerance)[0]
+            axis = find_axis(parts, self.matrices[generators(self.group)], self.tolerance)[0]
         else:
             axis = np.array([*self.axis, 0.0])
         standing = stand(parts, self.group, axis, self.tolerance)
@@ -135,16 +143,27 @@ class Search:
                 qpos[start : start + 3], qpos[start + 3 : start + 7] = place, q
         return Pose(pose.words, qpos, mocap_pos, mocap_quat)
 
-    def _settled(self, stance: Stance) -> Stance:
-        """The stance at the pose's average over the group, if the robot fits there as well."""
-        qpos = self._average(stance)
-        if np.abs(qpos - stance.pose.qpos).max(initial=0.0) < 1e-12:
-            return stance
-        even = self._at(stance.pose.at(qpos))
-        same = all(a.images == b.images for a, b in zip(even.matchers, stance.matchers, strict=True))
-        return even if same and even.misfit <= 1.1 * stance.misfit + 1e-6 else stance
+    def _in_range(self, stance: Stance) -> bool:
+        """Whether a pose that was solved for fits, and sends ranges of joints to ranges."""
+        return stance.misfit <= 1 and all(
+            matcher.pairing.range_gap(i, j) <= _RANGE
+            for matcher in stance.matchers
+            for i, j in matcher.joints().items()
+        )
 
-    def _average(self, stance: Stance) -> Array:
+    def _settled(self, stance: Stance) -> Stance:
+        """The stance at the pose's average over the group, if the robot fits there as well or better."""
+        best = stance
+        for by_ranges in (False, True):
+            qpos = self._average(stance, by_ranges)
+            if np.abs(qpos - best.pose.qpos).max(initial=0.0) > 1e-12:
+                even = self._at(stance.pose.at(qpos))
+                same = all(a.images == b.images for a, b in zip(even.matchers, best.matchers, strict=True))
+                factor = _CLEARLY if by_ranges else 1.1
+                best = even if same and even.misfit <= factor * best.misfit + 1e-9 else best
+        return best
+
+    def _average(self, stance: Stance, by_ranges: bool) -> Array:
         """Mean over the group of the images of hinges and slides, small offsets taken for none."""
         model, qpos = self.model, stance.pose.qpos
         sums = np.zeros(model.nq)
@@ -158,21 +177,19 @@ class Search:
                     limit = _SNAP
                     if int(model.jnt_type[i]) == SLIDE:
                         limit *= matcher.pairing.parts.size(int(model.jnt_bodyid[i]))
-                    sums[end] += sign * qpos[start] + self._snapped(i, j, sign, offset, limit)
+                    sums[end] += sign * qpos[start] + self._snapped(i, j, sign, offset, limit, by_ranges)
         even = qpos.copy()
         address = model.jnt_qposadr[on_line]
         even[address] = sums[address] / len(stance.matchers)
         return even
 
-    def _snapped(self, i: int, j: int, sign: float, offset: float, limit: float) -> float:
+    def _snapped(self, i: int, j: int, sign: float, offset: float, limit: float, by_ranges: bool) -> float:
         """An offset, or the one near it that is meant: none, or that between the ranges."""
-        if abs(offset) < limit:
-            return 0.0
+        meant = [0.0]
         if self.model.jnt_limited[i] and self.model.jnt_limited[j]:
             middles = self.model.jnt_range[[i, j]].mean(axis=1)
-            if abs(middles[1] - sign * middles[0] - offset) < limit:
-                return float(middles[1] - sign * middles[0])
-        return offset
+            meant.insert(0 if by_ranges else 1, float(middles[1] - sign * middles[0]))
+        return next((value for value in meant if abs(value - offset) < limit), offset)
 
     def _refuse(self, tried: list[Stance]) -> NoReturn:
         best = min(tried, key=lambda stance: stance.misfit)

@@ -9,7 +9,9 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.sensor_rules import POSES
-from torchrl_sym.mujoco.model.shapes import DIRECTIONS, active_geoms, support
+from torchrl_sym.mujoco.model.filters import active_geoms
+from torchrl_sym.mujoco.model.releases import weld_ids
+from torchrl_sym.mujoco.model.shapes import DIRECTIONS, supports
 from torchrl_sym.mujoco.model.types import Array, MjData
 
 MISFIT = 1e6  # of a pair that cannot be the image of each other
@@ -28,7 +30,7 @@ class Places:
         """The link that an object is on."""
         owners = {"SITE": "site_bodyid", "GEOM": "geom_bodyid", "CAMERA": "cam_bodyid"}
         body = int(getattr(self.model, owners[kind])[index]) if kind in owners else index
-        return int(self.model.body_weldid[body])
+        return int(weld_ids(self.model)[body])
 
     def gap(self, kind: str, a: int, b: int) -> float:
         """Distance of object b from the image of a, on its link."""
@@ -41,7 +43,7 @@ class Places:
 
     def body_gap(self, a: int, b: int) -> float:
         """The same for whole bodies: one that moves a link, or a part welded to it, by its mass centre."""
-        welds = self.model.body_weldid
+        welds = weld_ids(self.model)
         if int(welds[a]) == a or int(welds[b]) == b:
             return 0.0 if self.matcher.images.get(a) == b else MISFIT
         return self.gap("BODY", a, b)
@@ -53,7 +55,8 @@ class Places:
 
         def reach(pose: MjData, site: int, directions: Array) -> Array:
             rotation, kind = pose.site_xmat[site].reshape(3, 3), int(self.model.site_type[site])
-            return support(kind, self.model.site_size[site], pose.site_xpos[site], rotation, directions)
+            size, place = self.model.site_size[[site]], pose.site_xpos[[site]]
+            return supports(kind, size, place, rotation[None], directions)[0]
 
         away = reach(self.data, a, DIRECTIONS @ self.turn) - reach(self.image, b, DIRECTIONS)
         return float(np.abs(away).max()) / self.matcher.size(self.link("SITE", b))

@@ -6,6 +6,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.matching import Matcher
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, MjModel
 
 
@@ -14,7 +15,7 @@ def map_sites(
 ) -> dict[int, int]:
     """Image of every site that has one: on the image link, where R sends it."""
     images: dict[int, int] = {}
-    owner = model.body_weldid[model.site_bodyid]
+    owner = weld_ids(model)[model.site_bodyid]
     for a, b in bodies.items():
         mine, theirs = np.flatnonzero(owner == a), np.flatnonzero(owner == b)
         if not len(mine) or not len(theirs):
@@ -32,7 +33,7 @@ def map_sites(
 
 def site_gap(matcher: Matcher, a: int, b: int) -> float:
     """Distance of site b from the image of site a, relative to what moves; infinite on another link."""
-    owners = matcher.model.body_weldid[matcher.model.site_bodyid[[a, b]]]
+    owners = weld_ids(matcher.model)[matcher.model.site_bodyid[[a, b]]]
     if matcher.images.get(int(owners[0])) != int(owners[1]):
         return np.inf
     gap = matcher.matrix @ matcher.data.site_xpos[a] - matcher.image.site_xpos[b]

@@ -25,29 +25,42 @@ _OFF_AXIS = 1e-2  # of a tree's size: what is nearer to the hinge says nothing a
 _SAME = 1e-7  # an angle better by less is no better
 
 
-def solved(model: MjModel, group: PointGroup, pose: Pose, axis: Array, carried: frozenset[int]) -> Pose:
-    """The pose with hinges and slides moved so that the group keeps it, as far as can be."""
-    return _Solver(model, group, pose, axis, carried).solve()
+def solved(
+    model: MjModel, group: PointGroup, pose: Pose, axis: Array, carried: frozenset[int], tolerance: float
+) -> Pose | None:
+    """The pose with hinges and slides moved so that the group keeps it; None if that does not help."""
+    return _Solver(model, group, pose, axis, carried, tolerance).solve()
+
+
+class _Hopeless(Exception):
+    """A joint has no image, wherever the joints are that it does not hang on."""
 
 
 class _Solver:
     def __init__(
-        self, model: MjModel, group: PointGroup, pose: Pose, axis: Array, carried: frozenset[int]
+        self,
+        model: MjModel,
+        group: PointGroup,
+        pose: Pose,
+        axis: Array,
+        carried: frozenset[int],
+        tolerance: float,
     ) -> None:
         self.model, self.group, self.pose, self.axis, self.carried = model, group, pose, axis, carried
+        self.tolerance = tolerance
         self.qpos = pose.qpos.copy()
         self.settled: set[int] = set()
         self.images: list[dict[int, int]] = [{0: 0} for _ in range(group.order)]
 
-    def solve(self) -> Pose:
-        parts = self._parts()
-        # siblings are told apart by what is beyond them only where their joints coincide
-        queue = [(0, self._siblings(parts, 0))]
-        while queue:
-            _, children = queue.pop(0)
-            for a in children:
-                self._settle(a)
-            queue += [(a, self._siblings(self._parts(), a)) for a in children]
+    def solve(self) -> Pose | None:
+        try:
+            queue = [self._siblings(self._parts(), 0)]
+            while queue:
+                for a in queue.pop(0):
+                    self._settle(a)
+                    queue.append(self._siblings(self._parts(), a))
+        except _Hopeless:
+            return None
         return self.pose.at(self.qpos, f"{self.pose.words}, with joints moved to where they are symmetric")
 
     def _parts(self) -> Parts:
@@ -63,11 +76,14 @@ class _Solver:
             theirs = [c for c in parts.links[images[a]].children if c not in self.carried]
             pairing = Pairing(parts, matrix)
             table = np.array([[self._likeness(pairing, c, d) for d in theirs] for c in mine])
-            if len(mine) and len(theirs):
-                rows, columns = linear_sum_assignment(table)
-                images |= {
-                    mine[r]: theirs[c] for r, c in zip(rows, columns, strict=True) if table[r, c] < 1e2
-                }
+            if len(mine) != len(theirs):
+                raise _Hopeless
+            for r, c in zip(*linear_sum_assignment(table), strict=True) if mine else ():
+                joints = pairing.joints_to(mine[r], theirs[c])
+                costs = [pairing.joint_cost(i, j) for i, j in joints.items()]
+                if table[r, c] >= 1e3 or max(costs, default=0.0) > self.tolerance:
+                    raise _Hopeless
+                images[mine[r]] = theirs[c]
         return mine
 
     def _likeness(self, pairing: Pairing, a: int, b: int) -> float:
@@ -83,7 +99,22 @@ class _Solver:
         cost = sum(pairing.joint_cost(i, j) for i, j in pairing.joints_to(a, b).items())
         cost += abs(one.mass - other.mass) / pairing.total_mass
         moments = np.linalg.eigvalsh(one.inertia) - np.linalg.eigvalsh(other.inertia)
-        return cost + float(np.abs(moments).max()) / pairing.total_inertia + 1e-9 * (a != b)
+        cost += float(np.abs(moments).max()) / pairing.total_inertia + 1e-9 * (a != b)
+        return cost + sum(self._off_path(pairing, a, b, j) for j in other.joints[:1])
+
+    def _off_path(self, pairing: Pairing, a: int, b: int, joint: int) -> float:
+        """How far link a's centre of mass stays from that of b, however its first joint moves it."""
+        parts, axis = pairing.parts, pairing.parts.axes[joint]
+        ends = pairing.matrix @ parts.centers[a], parts.centers[b]
+        if int(self.model.jnt_type[joint]) == SLIDE:
+            gap = ends[0] - ends[1]
+            return float(np.linalg.norm(gap - (gap @ axis) * axis)) / parts.size(b)
+        if int(self.model.jnt_type[joint]) != HINGE:
+            return 0.0
+        arms = [end - parts.anchors[joint] for end in ends]
+        along = [float(arm @ axis) for arm in arms]
+        radii = [float(np.linalg.norm(arm - h * axis)) for arm, h in zip(arms, along, strict=True)]
+        return float(np.hypot(along[0] - along[1], radii[0] - radii[1])) / parts.size(b)
 
     def _settle(self, a: int) -> None:
         """Move the joints of the images of a link to where they belong, or its own where it is one."""

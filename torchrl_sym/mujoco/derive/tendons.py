@@ -13,8 +13,8 @@ from torchrl_sym.mujoco.derive.coordinates import CoordinateMap
 from torchrl_sym.mujoco.derive.images import Image, SymmetryError, assign, mixture
 from torchrl_sym.mujoco.derive.lengths import coordinate_offsets, is_fixed, tendon_length
 from torchrl_sym.mujoco.derive.matching import Matcher
-from torchrl_sym.mujoco.derive.paths import path_gap, path_words
-from torchrl_sym.mujoco.model.types import Array, label_of
+from torchrl_sym.mujoco.derive.paths import links_of_path, path_gap, path_words
+from torchrl_sym.mujoco.model.types import Array, MjModel, label_of
 
 _COEFFICIENTS = 0.3  # relative: tendons that couple the same joints nearly alike; the audit says how nearly
 _PLACES = 10.0  # tolerances that a path may be off, as for centres of mass
@@ -28,14 +28,18 @@ def map_tendons(matcher: Matcher, map_: CoordinateMap, tolerance: float) -> dict
         SymmetryError: a tendon couples joints or sites whose images no tendon couples.
     """
     model, count = matcher.model, matcher.model.ntendon
+    if np.array_equal(matcher.matrix, np.eye(3)):
+        return {t: Image(t) for t in range(count)}
     lengths = [tendon_length(model, t)[: model.nv] for t in range(count)]
     signs, cost = np.ones((count, count)), np.full((count, count), _MISFIT)
+    alike: dict[tuple, list[int]] = {}
+    for u in range(count):
+        alike.setdefault(_couples(model, u, lengths[u], {}), []).append(u)
     for t in range(count):
-        for u in range(count):
-            if is_fixed(model, t) != is_fixed(model, u):
-                continue
+        moved = map_.qvel @ lengths[t]
+        for u in alike.get(_couples(model, t, moved, matcher.images), ()):
             if is_fixed(model, t):
-                gap, signs[t, u] = _coefficient_gap(map_.qvel @ lengths[t], lengths[u])
+                gap, signs[t, u] = _coefficient_gap(moved, lengths[u])
                 fits = gap <= _COEFFICIENTS
             else:
                 gap = path_gap(matcher, t, u)
@@ -53,6 +57,16 @@ def map_tendons(matcher: Matcher, map_: CoordinateMap, tolerance: float) -> dict
     for image in images.values():
         image.offset = float(lengths[image.index] @ shifts)
     return images
+
+
+def _couples(model: MjModel, tendon: int, length: Array, images: dict[int, int]) -> tuple:
+    """What a tendon and its image have in common: which dofs it couples, or the links that it runs over."""
+    if is_fixed(model, tendon):
+        return ("fixed", *np.flatnonzero(np.abs(length) > 1e-9).tolist())
+    return (
+        "spatial",
+        *sorted((kind, images.get(link, link)) for kind, link in links_of_path(model, tendon)),
+    )
 
 
 def _coefficient_gap(moved: Array, other: Array) -> tuple[float, float]:

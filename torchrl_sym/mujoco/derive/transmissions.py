@@ -16,6 +16,7 @@ from torchrl_sym.mujoco.derive.images import Image
 from torchrl_sym.mujoco.derive.lengths import joint_length, map_lengths, tendon_length
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.sites import site_frame, site_gap
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import BALL, FREE, Array, MjModel, mj
 
 _KINDS = {
@@ -186,7 +187,7 @@ class Transmissions:
 
     def _bodies(self, a: int, b: int) -> Fit | None:
         bodies = self.model.actuator_trnid[[a, b], 0]
-        one, other = (int(link) for link in self.model.body_weldid[bodies])
+        one, other = (int(link) for link in weld_ids(self.model)[bodies])
         return Fit(1.0) if self.map.bodies.get(one) == other else None
 
     def is_servo(self, a: int) -> bool:

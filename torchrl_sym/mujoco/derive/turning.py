@@ -17,14 +17,15 @@ import numpy as np
 
 from torchrl_sym.mujoco.derive.pairing import Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
-from torchrl_sym.mujoco.model.shapes import DIRECTIONS, support
-from torchrl_sym.mujoco.model.types import Array, MjModel, mj
+from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, geom_supports
+from torchrl_sym.mujoco.model.types import Array, mj
 
+_FAR = 1e3  # misfit (in tolerances) where links have no image nearby
 _MOST = 24  # headings that are tried at most
 _NEAR = 0.1  # of a tree's size: farther from every other link, a link's image is no link
 _QUARTER = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # renames the axes
-_MESH = int(mj.mjtGeom.mjGEOM_MESH)
 
 
 class Turning:
@@ -33,12 +34,15 @@ class Turning:
     Args:
         parts: the model at a pose.
         matrices: the group's elements, ``(n, 3, 3)``.
+        generators: elements that are tried.
         tolerance: of the pairs of joints.
     """
 
-    def __init__(self, parts: Parts, matrices: Array, tolerance: float) -> None:
+    def __init__(self, parts: Parts, matrices: Array, generators: list[int], tolerance: float) -> None:
         self.parts, self.model, self.matrices, self.tolerance = parts, parts.model, matrices, tolerance
-        self._shapes: dict[int, tuple[Array, Array]] = {}
+        self.generators = generators
+        # trees whose first joints have images in some turn: then it is the pose, if others have none
+        self.held: set[int] = set()
 
     def usual(self, tree: int) -> list[tuple[str, Array]]:
         """Turns that are tried first, in words and as matrices: the same for all trees."""
@@ -96,9 +100,12 @@ class Turning:
     def _misfit(self, a: int, b: int, matrix: Array, acting: Array) -> float:
         if self.is_rigid(a) and self.is_rigid(b):
             return self._rigid(a, b, matrix)
-        if not self._near(a, b, matrix):
-            return np.inf
         pairing = Pairing(self.parts, matrix, acting)
+        if not pairing.holds(a, b, self.tolerance):
+            return np.inf
+        self.held.add(a)
+        if not self._near(a, b, matrix):
+            return _FAR
         return pairing.worst(pairing.images(a, b), self.tolerance).size
 
     def _near(self, a: int, b: int, matrix: Array) -> bool:
@@ -124,17 +131,14 @@ class Turning:
 
     def _hull(self, tree: int, directions: Array) -> Array:
         """Support function, about its point, of what may collide on a tree's first link, else of all."""
-        model, data = self.model, self.parts.data
-        geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid] == tree)
+        model = self.model
+        geoms = np.flatnonzero((weld_ids(model)[model.geom_bodyid] == tree) & (model.geom_type != PLANE))
         touching = geoms[(model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)]
-        reach = np.full(len(directions), -np.inf)
-        for g in touching if len(touching) else geoms:
-            kind, center = int(model.geom_type[g]), data.geom_xpos[g] - self.parts.points[tree]
-            frame, size = data.geom_xmat[g].reshape(3, 3), model.geom_size[g]
-            reach = np.maximum(
-                reach, support(kind, size, center, frame, directions, _vertices(model, int(g)))
-            )
-        return np.where(np.isfinite(reach), reach, 0.0)
+        geoms = touching if len(touching) else geoms
+        if not len(geoms):
+            return np.zeros(len(directions))
+        reach = geom_supports(model, self.parts.data, geoms, directions).max(axis=0)
+        return reach - directions @ self.parts.points[tree]
 
     def _headings(self, tree: int, base: Array) -> list[float]:
         """Angles by which a robot may be turned so that some pair of its links is mirrored, least first."""
@@ -172,11 +176,3 @@ def _heading(frame: Array) -> Array:
 def _turn(angle: float) -> Array:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _vertices(model: MjModel, geom: int) -> Array | None:
-    if int(model.geom_type[geom]) != _MESH:
-        return None
-    mesh = int(model.geom_dataid[geom])
-    start = int(model.mesh_vertadr[mesh])
-    return model.mesh_vert[start : start + int(model.mesh_vertnum[mesh])]

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchrl_sym import checks
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import FREE, Array, MjData, MjModel, name_of
 
 
@@ -35,9 +36,9 @@ def links_of(model: MjModel, data: MjData) -> dict[int, Link]:
     """Links by the number of the body that moves them, the world (0) first."""
     links: dict[int, Link] = {}
     for body in range(model.nbody):
-        root = int(model.body_weldid[body])
+        root = int(weld_ids(model)[body])
         if root == body:
-            parent = int(model.body_weldid[model.body_parentid[body]]) if body else -1
+            parent = int(weld_ids(model)[model.body_parentid[body]]) if body else -1
             start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
             links[body] = Link(body, parent, joints=list(range(start, start + count)))
             if body:
@@ -74,7 +75,7 @@ def sizes_of(model: MjModel, data: MjData, links: dict[int, Link]) -> dict[int, 
     bounded = (model.geom_rbound > 0)[:, None]  # planes are not
     low = np.concatenate([data.xpos, np.where(bounded, centers - halves, np.inf)])
     high = np.concatenate([data.xpos, np.where(bounded, centers + halves, -np.inf)])
-    root = np.array([links[b].tree for b in model.body_weldid])
+    root = np.array([links[b].tree for b in weld_ids(model)])
     owner = np.concatenate([root, root[model.geom_bodyid]])
     bottom, top = np.full((model.nbody, 3), np.inf), np.full((model.nbody, 3), -np.inf)
     np.minimum.at(bottom, owner, low)
@@ -114,7 +115,7 @@ def carried_bodies(model: MjModel, names: Sequence[str]) -> frozenset[int]:
                 f"{name!r} cannot be carried: it is neither a free body (one free joint) nor a mocap body; "
                 "what hangs on a robot or is fixed is mapped with it"
             )
-        below = np.flatnonzero((model.body_rootid == body) & (model.body_weldid != body))
+        below = np.flatnonzero((model.body_rootid == body) & (weld_ids(model) != body))
         if len(below):
             raise ValueError(
                 f"{name!r} cannot be carried: {name_of(model, 'body', int(below[0]))!r} moves on it, and "

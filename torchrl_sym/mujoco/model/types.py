@@ -77,3 +77,8 @@ def check_mocap(model: MjModel, position: Any, rotation: Any) -> None:
             raise ValueError(
                 f"{name}: expected a tensor (..., {model.nmocap}, {size}), got {checks.shown(x)}"
             )
+
+
+def dofs_of(model: MjModel, joint: int) -> int:
+    """Number of degrees of freedom of a joint."""
+    return {FREE: 6, BALL: 3}.get(int(model.jnt_type[joint]), 1)

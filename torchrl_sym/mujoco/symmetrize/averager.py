@@ -17,6 +17,7 @@ from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.derive import derive
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import quaternion, rotation
 from torchrl_sym.mujoco.model.types import Array, label_of, mj, name_of
 from torchrl_sym.mujoco.symmetrize.report import Change, SymmetrizeReport
@@ -83,7 +84,7 @@ class Averager:
     def closed(self, maps: Maps, kind: str) -> Maps:
         """The part of the maps on which the group acts; what has no image is noted in the report."""
         table = self.group.table
-        owner = self.model.body_weldid[getattr(self.model, f"{kind}_bodyid")]
+        owner = weld_ids(self.model)[getattr(self.model, f"{kind}_bodyid")]
         own = {a for a, body in enumerate(owner) if int(body) in self.carried}
         everything = set().union(*maps) - own
         good = {
@@ -147,7 +148,7 @@ class Averager:
 
     def in_body(self, body: int, place: Array) -> Array:
         """A world position in the frame of a body, where that ends up."""
-        origin = self.data.xpos[body] + self.moved[int(self.model.body_weldid[body])]
+        origin = self.data.xpos[body] + self.moved[int(weld_ids(self.model)[body])]
         return self.rotation[body].T @ (place - origin)
 
 

@@ -136,6 +136,5 @@ def _signed(
 
 
 def _polynomial(model: Any, name: str) -> Array:
-    """Coefficients of a damping or stiffness; older releases of MuJoCo have the linear one only."""
-    linear = np.asarray(getattr(model, name))[:, None]
-    return np.concatenate([linear, getattr(model, f"{name}poly", linear[:, :0])], axis=1)
+    """Coefficients of a damping or stiffness."""
+    return np.column_stack([getattr(model, name), getattr(model, f"{name}poly")])

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchrl_sym.mujoco.model.links import is_loose
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.types import BALL, HINGE, SLIDE, mj, name_of
 from torchrl_sym.mujoco.symmetrize.averager import Averager, frame_of
@@ -62,6 +63,6 @@ def _write_body(averager: Averager, body: int, joints: list[int], anchors: dict,
         turn = turn @ rotation(q).T
         place = anchors[j] - turn @ at
     parent = int(model.body_parentid[body])
-    base = data.xpos[parent] + averager.moved[int(model.body_weldid[parent])]
+    base = data.xpos[parent] + averager.moved[int(weld_ids(model)[parent])]
     outer = averager.rotation[parent]
     averager.pose(averager.spec.bodies[body], outer.T @ (place - base), outer.T @ turn, "body", name)

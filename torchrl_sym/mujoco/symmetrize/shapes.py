@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, mj, name_of
 from torchrl_sym.mujoco.symmetrize.averager import Averager
 from torchrl_sym.mujoco.symmetrize.parameters import average_unsigned
@@ -22,7 +23,7 @@ def average_sites(averager: Averager) -> None:
     """Places of sites."""
     model = averager.model
     maps = averager.closed([action.sites for action in averager.actions], "site")
-    owner = model.body_weldid[model.site_bodyid]
+    owner = weld_ids(model)[model.site_bodyid]
     for b, place in averager.points(maps, averager.data.site_xpos, lambda s: int(owner[s])).items():
         local = averager.in_body(int(model.site_bodyid[b]), place)
         name = name_of(model, "site", b)
@@ -65,7 +66,7 @@ class _Geoms:
 
     def __init__(self, averager: Averager) -> None:
         self.averager, self.model, self.turns = averager, averager.model, averager.turns
-        self.owner = self.model.body_weldid[self.model.geom_bodyid]
+        self.owner = weld_ids(self.model)[self.model.geom_bodyid]
         self.links = [int(b) for b in self.owner]
         moved = np.array([averager.moved[b] for b in self.links]).reshape(-1, 3)
         self.centers = averager.data.geom_xpos + moved

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.audit.geoms import PLANE
+from torchrl_sym.mujoco.model.shapes import PLANE
 from torchrl_sym.mujoco.symmetrize.averager import Averager, MjSpec
 from torchrl_sym.mujoco.symmetrize.inertials import average_inertials
 from torchrl_sym.mujoco.symmetrize.parameters import average_actuators, average_joints

@@ -7,6 +7,7 @@ two futures: something outside the state decides, and no other row says anything
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torchrl_sym import checks
@@ -60,29 +61,40 @@ class VerifyReport:
         states: number of states tested.
         contacts: how many of them were in contact. With none, contact was not tested.
         identity: name of the identity, whose rows the table leaves out while they pass.
+        untested: what was not tested at all, in words: contact that was never reached, actions without
+            effect, elements that change nothing.
     """
 
     rows: list[VerifyRow]
     states: int
     contacts: int
     identity: str = "identity"
+    untested: Sequence[str] = ()
 
     @property
     def passed(self) -> bool:
-        return all(row.passed for row in self.rows)
+        """Whether every row passes, and nothing is untested."""
+        return not self.untested and all(row.passed for row in self.rows)
+
+    @property
+    def deterministic(self) -> bool:
+        """Whether one state has one future: the identity passes. If not, no other row says anything."""
+        return all(row.passed for row in self.rows if row.element == self.identity)
 
     @property
     def tested(self) -> bool:
-        """Whether one state has one future: the identity passes. If not, no other row says anything."""
-        return all(row.passed for row in self.rows if row.element == self.identity)
+        """Whether the rows say something of the symmetry: one state has one future, nothing is untested."""
+        return self.deterministic and not self.untested
 
     @property
     def verdict(self) -> str:
         """One sentence: symmetric, not symmetric, or not tested."""
         if self.passed:
             return "symmetric"
-        if self.tested:
+        if self.deterministic and not all(row.passed for row in self.rows):
             return f"not symmetric, first in {self.worst.part}"
+        if self.deterministic:
+            return f"not tested: {'; '.join(self.untested)}"
         return (
             "not tested: the environment remembers something that its state does not hold, or draws noise, "
             f"so that nothing below says anything of the symmetry (first in {self.worst.part}, "
@@ -109,5 +121,6 @@ class VerifyReport:
         shown = [row for row in self.rows if row.element != self.identity or not row.passed]
         header = f"{'part':<17s} {'element':<12s} {'residual':>9s} {'limit':>9s}  {'':<8s}  worst at"
         count = f"{self.states} states, {self.contacts} in contact"
-        title = f"{self.verdict}: {count}" if self.tested else f"{self.verdict}\n\n{count}"
+        count += "".join(f"\nnot tested: {what}" for what in self.untested)
+        title = f"{self.verdict}: {count}" if self.deterministic else f"{self.verdict}\n\n{count}"
         return "\n".join([title, "", header, *map(str, shown)])
