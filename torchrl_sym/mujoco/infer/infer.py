@@ -33,7 +33,7 @@ def infer(
     group: PointGroup,
     *,
     keyframe: int | str | None = None,
-    axis: Sequence[float] | None = None,
+    axis: tuple[float, float] | None = None,
     carried: Sequence[str] = (),
     memory: Mapping[str, Representation] | Remembered | None = None,
     observe: Callable[[Any], Any] | None = None,
