@@ -222,7 +222,10 @@ def test_actions_are_found_by_what_they_do(make, act, size, expected):
 def test_wrappers_that_remember(make):
     env = FrameStackObservation(RescaleAction(make(state), -2.0, 2.0), 3)
     frame = FREE + ARMS + polar(MIRROR) + axial(MIRROR) + ARMS
-    assert same(infer(env, MIRROR)["observation"], (frame * 3).unflatten((3, 17)))
+    symmetry = infer(env, MIRROR)
+    assert same(symmetry["observation"], (frame * 3).unflatten((3, 17)))
+    with pytest.raises(ValueError, match="go through FrameStackObservation, which remembers: take what is"):
+        verify(env, symmetry, states=1)
 
 
 WRONG = {

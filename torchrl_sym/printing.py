@@ -37,7 +37,7 @@ def table(group: PointGroup, parts: Parts, labels: Labels | None = None) -> str:
     lines = [f"Symmetry under {', '.join(group.names)}"]
     for keys, representation in parts:
         names = _labels(keys, representation, labels)
-        lines += ["", f"{' and '.join(map(_shown, keys))}: {representation.dim} entries"]
+        lines += ["", f"{' and '.join(map(_shown, keys))}: {_count(representation.dim)}"]
         rows = [["", "", *group.names[1:]]]
         for segment in segments(representation, names):
             rows.append([_span(segment), segment.builder])
@@ -212,7 +212,11 @@ def _sources(representation: Representation, i: int) -> list[str]:
 
 def _term(j: int, w: float, first: bool) -> str:
     sign = ("-" if w < 0 else "") if first else ("- " if w < 0 else "+ ")
-    return f"{sign}{j}" if abs(w) == 1 else f"{sign}{abs(w):.3g}*{j}"
+    return f"{sign}[{j}]" if abs(w) == 1 else f"{sign}{abs(w):.3g} [{j}]"
+
+
+def _count(entries: int) -> str:
+    return "1 entry" if entries == 1 else f"{entries} entries"
 
 
 def _span(segment: Segment, stop: int | None = None) -> str:
