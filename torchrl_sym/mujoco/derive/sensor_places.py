@@ -70,6 +70,7 @@ class Places:
         """Geoms of a body, or of its subtree, that may collide."""
         if self._active is None:
             self._active = active_geoms(self.model).tolist()
+        active = self._active or []
         owners, parents = self.model.geom_bodyid, self.model.body_parentid
 
         def inside(owner: int) -> bool:
@@ -77,7 +78,7 @@ class Places:
                 owner = int(parents[owner])
             return owner == body
 
-        return [g for g in self._active if inside(int(owners[g]))]
+        return [g for g in active if inside(int(owners[g]))]
 
     def frame(self, one: Object | None, other: Object | None) -> Array:
         """The matrix V between the frames of two objects; R itself for the world's."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrl_sym.groups import PointGroup
@@ -187,7 +188,7 @@ class ActionFinder:
         raise InferenceError(f"'action' does not transform orthogonally; {_REMEDY}:", faults)
 
 
-def _moves(effects: Array) -> Array:
+def _moves(effects: Array) -> NDArray[np.bool_]:
     """Which actions make a difference, by the columns of their effects."""
     size = np.linalg.norm(effects, axis=0)
     return size > _STILL * max(float(size.max(initial=0.0)), 1.0)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey
 
 from torchrl_sym.entries import Exchanged, opposites
@@ -78,7 +79,7 @@ class ObservationFinder:
         """Largest value of each entry."""
         return np.maximum(self.samples.values[key].abs().amax(dim=(0, 1)).numpy(), 1e-6)
 
-    def hidden(self, key: NestedKey) -> Array:
+    def hidden(self, key: NestedKey) -> NDArray[np.bool_]:
         """Entries that differ between two observations of one state, ``(d,)`` bool."""
         return self.samples.hidden[key].numpy() > self.margin(key)
 

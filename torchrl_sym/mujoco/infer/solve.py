@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.infer.columns import Classes, classes_of, matches
@@ -35,13 +36,13 @@ class Solution:
     """
 
     matrices: Array
-    failed: Array
+    failed: NDArray[np.bool_]
     reasons: dict[tuple[int, int], str] = field(default_factory=dict)
     constant: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
     twins: list[list[int]] = field(default_factory=list)
     events: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
     off: Array = field(default_factory=lambda: np.zeros(0))
-    surprised: Array = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    surprised: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     @property
     def complete(self) -> bool:
@@ -125,7 +126,7 @@ def _reduced(
 
 def _orthogonal(group: PointGroup, matrices: Array, wrong: Array) -> tuple[Array, Array]:
     """Make nearly orthogonal matrices so; rows of blocks that are not are wrong, too."""
-    touched = (np.abs(matrices) > 0).any(axis=0)
+    touched = np.array((np.abs(matrices) > 0).any(axis=0))
     label = np.arange(len(touched))
     linked = touched | touched.T | np.eye(len(touched), dtype=bool)
     while True:
@@ -136,14 +137,14 @@ def _orthogonal(group: PointGroup, matrices: Array, wrong: Array) -> tuple[Array
     out, wrong = matrices.copy(), wrong.copy()
     for first in np.unique(label):
         block = np.flatnonzero(label == first)
-        part = matrices[np.ix_(range(len(matrices)), block, block)]
+        part = matrices[np.ix_(np.arange(len(matrices)), block, block)]
         gap = np.abs(part @ part.swapaxes(1, 2) - np.eye(len(block))).max()
         if wrong[:, block].any() or gap > _ORTHOGONAL:
             wrong[1:, block] |= (
                 np.abs(part @ part.swapaxes(1, 2) - np.eye(len(block))).max(axis=2) > _ORTHOGONAL
             )[1:]
         else:
-            out[np.ix_(range(len(matrices)), block, block)] = polished(group, part)
+            out[np.ix_(np.arange(len(matrices)), block, block)] = polished(group, part)
     return out, wrong
 
 

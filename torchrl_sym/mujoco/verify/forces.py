@@ -40,7 +40,7 @@ class Disturbances:
         """Additions to ``cfrc_ext`` and ``sensordata``, by these names, a row each."""
         model = self.robot.model
         force = _SIZE * (2 * torch.rand(1, model.nbody, 6, generator=generator, dtype=torch.float64) - 1)
-        force[:, (self.bodies < 0).any(axis=0)] = 0.0
+        force[:, torch.as_tensor((self.bodies < 0).any(axis=0))] = 0.0
         out = {"cfrc_ext": force}
         if self.sensors is not None:
             size = (1, model.nsensordata)

@@ -125,7 +125,7 @@ class Subject(abc.ABC):
             return dict(observation.items(include_nested=True, leaves_only=True))
         if not isinstance(observation, Mapping):
             return {"observation": _row("observation", observation)}
-        return {key if len(key) > 1 else key[0]: _row(key, x) for key, x in _leaves(observation, ())}
+        return {key if len(key) > 1 else "".join(key): _row(key, x) for key, x in _leaves(observation, ())}
 
 
 def _leaves(observation: Mapping[str, Any], above: tuple[str, ...]) -> list[tuple[tuple[str, ...], Any]]:
