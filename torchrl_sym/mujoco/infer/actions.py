@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.infer.columns import Flags
 from torchrl_sym.mujoco.infer.errors import InferenceError, Unexplained
 from torchrl_sym.mujoco.infer.mixing import polished
 from torchrl_sym.mujoco.infer.samples import box_of, random_action
@@ -24,7 +25,7 @@ from torchrl_sym.mujoco.model.types import Array, name_of
 from torchrl_sym.mujoco.verify.subjects import Subject
 from torchrl_sym.representations import Representation
 
-_STATES = 3  # states in which every action is tried
+_STATES = 2  # states in which every action is tried
 _STILL = 1e-9  # change that is no more than rounding
 _STEP = 0.25  # of the way from the middle of the box to its end
 _ORTHOGONAL = 1e-3  # distance from orthogonal that is still taken for noise
@@ -188,7 +189,7 @@ class ActionFinder:
         raise InferenceError(f"'action' does not transform orthogonally; {_REMEDY}:", faults)
 
 
-def _moves(effects: Array) -> NDArray[np.bool_]:
+def _moves(effects: Array) -> Flags:
     """Which actions make a difference, by the columns of their effects."""
     size = np.linalg.norm(effects, axis=0)
     return size > _STILL * max(float(size.max(initial=0.0)), 1.0)

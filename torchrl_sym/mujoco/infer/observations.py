@@ -11,6 +11,7 @@ from tensordict import NestedKey
 
 from torchrl_sym.entries import Exchanged, opposites
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.infer.columns import Flags
 from torchrl_sym.mujoco.infer.errors import InferenceError
 from torchrl_sym.mujoco.infer.quantities import labels_of, names_of
 from torchrl_sym.mujoco.infer.samples import Sampler, Samples
@@ -58,7 +59,7 @@ class ObservationFinder:
                 break
             known = self.samples.count
             self.sampler.draw(known)
-            if number == 0:
+            if number == 0 and not self.sampler.subject.whole:
                 self.sampler.draw_patiently()
         names, quantities = names_of(self.sampler.subject), self.samples.quantities
         assert quantities is not None
@@ -79,7 +80,7 @@ class ObservationFinder:
         """Largest value of each entry."""
         return np.maximum(self.samples.values[key].abs().amax(dim=(0, 1)).numpy(), 1e-6)
 
-    def hidden(self, key: NestedKey) -> NDArray[np.bool_]:
+    def hidden(self, key: NestedKey) -> Flags:
         """Entries that differ between two observations of one state, ``(d,)`` bool."""
         return self.samples.hidden[key].numpy() > self.margin(key)
 

@@ -15,9 +15,11 @@ import torch
 from torch import Tensor
 
 from torchrl_sym.mujoco.derive import ModelSymmetry
-from torchrl_sym.mujoco.model.types import Array, MjModel, name_of
+from torchrl_sym.mujoco.model.types import Array, MjModel, mj, name_of
 from torchrl_sym.representations import Representation
 
+_KINDS = ("TOUCH", "FORCE", "TORQUE", "CONTACT", "TACTILE")
+_CONTACT = [kind for name in _KINDS if (kind := getattr(mj.mjtSensor, f"mjSENS_{name}", None)) is not None]
 _SIZE = 0.5  # largest number that is added: environments clip forces at 1
 
 
@@ -40,7 +42,7 @@ class Disturbances:
         """Additions to ``cfrc_ext`` and ``sensordata``, by these names, a row each."""
         model = self.robot.model
         force = _SIZE * (2 * torch.rand(1, model.nbody, 6, generator=generator, dtype=torch.float64) - 1)
-        force[:, torch.as_tensor((self.bodies < 0).any(axis=0))] = 0.0
+        force[:, np.flatnonzero((self.bodies < 0).any(axis=0))] = 0.0
         out = {"cfrc_ext": force}
         if self.sensors is not None:
             size = (1, model.nsensordata)
@@ -49,10 +51,13 @@ class Disturbances:
 
     @staticmethod
     def anything(model: MjModel, generator: torch.Generator) -> dict[str, Tensor]:
-        """Additions to everything, whether or not their images are known."""
+        """Additions to all that contact makes, whether or not their images are known."""
         sizes = {"cfrc_ext": (1, model.nbody, 6), "sensordata": (1, model.nsensordata)}
         draws = {k: torch.rand(x, generator=generator, dtype=torch.float64) for k, x in sizes.items()}
-        return {name: _SIZE * (0.5 + draw) for name, draw in draws.items()}
+        out = {name: _SIZE * (0.5 + draw) for name, draw in draws.items()}
+        felt = np.isin(model.sensor_type, [int(kind) for kind in _CONTACT])
+        out["sensordata"] *= torch.as_tensor(np.repeat(felt, model.sensor_dim))
+        return out
 
     def image(self, added: dict[str, Tensor], g: int) -> dict[str, Tensor]:
         """Images of what was drawn."""

@@ -62,11 +62,12 @@ class PhysicsSubject(Subject):
         data = self.data
         write_state(data, state)
         mj.mj_forward(self.model, data)
+        if self.memory:
+            self.memory.write(self.owner, state.memory)
+            mj.mj_forward(self.model, data)  # a target may be a place in the model
         mj.mj_rnePostConstraint(self.model, data)  # contact forces, which some observe
         data.qacc_warmstart[:] = state.qacc_warmstart[0].numpy()  # mj_forward replaced it
         Disturbances.add(data, state.added)
-        if self.memory:
-            self.memory.write(self.owner, state.memory)
 
     def transform(self, state: PhysicsState, g: int) -> PhysicsState:
         memory = self.memory.image(state.memory, g) if self.memory else {}

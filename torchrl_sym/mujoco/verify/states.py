@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,8 +36,7 @@ class PhysicsState:
 
     def rows(self, ids: slice) -> PhysicsState:
         """A copy."""
-        copies: dict[str, Any] = {n: x[ids].clone() for n, x in vars(self).items() if isinstance(x, Tensor)}
-        return PhysicsState(**copies, time=self.time, memory=self.memory)
+        return dataclasses.replace(self, **{name: getattr(self, name)[ids].clone() for name in _FIELDS})
 
 
 def read_state(data: MjData, memory: dict[str, Any]) -> PhysicsState:
