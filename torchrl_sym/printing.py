@@ -73,7 +73,10 @@ def code(group: PointGroup, parts: Parts, strict: bool = True, labels: Labels | 
     symmetry = f"symmetry = Symmetry(\n    group,\n    {{\n{body}    }},\n{options})"
     imports = f"from torchrl_sym import {', '.join(names)}\n"
     used = sorted(writer.used, key=lambda name: (name[0].islower(), name))
-    imports += f"from torchrl_sym.representations import {', '.join(used)}\n"
+    line = f"from torchrl_sym.representations import {', '.join(used)}"
+    if len(line) > _WIDTH:
+        line = f"from torchrl_sym.representations import (\n    {_wrapped(used, 4).strip()},\n)"
+    imports += f"{line}\n"
     if "torch." in made + symmetry:
         imports = "import torch\n\n" + imports
     return f"{imports}\n{made}\n{symmetry}"

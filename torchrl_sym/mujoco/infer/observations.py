@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from tensordict import NestedKey
 
-from torchrl_sym.entries import Exchanged
+from torchrl_sym.entries import Exchanged, opposites
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.infer.errors import InferenceError
 from torchrl_sym.mujoco.infer.quantities import labels_of, names_of
@@ -92,7 +92,7 @@ class ObservationFinder:
 
     def _solutions(self, known: int) -> dict[Keys, Solution]:
         """One for each key; those of keys that have none by themselves together, if that helps."""
-        found = {(key,): self._solve((key,), known) for key in self.samples.values}
+        found = {keys: self._solve(keys, known) for keys in self._sides()}
         alone = [keys for keys, solution in found.items() if not solution.complete]
         if len(alone) < 2:
             return found
@@ -100,10 +100,21 @@ class ObservationFinder:
         joint = self._solve(together, known)
         for keys in _exchanged(joint, [self.samples.values[key].shape[-1] for key in together], together):
             if len(keys) > 1 and (part := self._solve(keys, known)).complete:
-                for key in keys:
-                    del found[key,]
-                found[keys] = part
+                found = {old: s for old, s in found.items() if old[0] not in keys} | {keys: part}
         return found
+
+    def _sides(self) -> list[Keys]:
+        """Each key by itself; those named after sides that an element exchanges together."""
+        keys = list(self.samples.values)
+        turned = self.group.matrices.diagonal(dim1=-2, dim2=-1) < -1 + 1e-9
+        pairs = [(a, b) for a, b, axis in opposites(keys) if turned[:, axis].any()]
+        owner = {key: key for key in keys}
+        for a, b in pairs:
+            old, new = owner[b], owner[a]
+            owner = {key: new if first == old else first for key, first in owner.items()}
+        return [
+            tuple(key for key in keys if owner[key] == first) for first in dict.fromkeys(owner.values())
+        ]
 
     def _solve(self, keys: Keys, known: int) -> Solution:
         """From the samples known, checked on the rest."""

@@ -16,7 +16,7 @@ from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.model.types import MjModel, mj
 from torchrl_sym.mujoco.verify.forces import Disturbances
-from torchrl_sym.mujoco.verify.poses import KINDS, TRIES, random_pose, reach_contact
+from torchrl_sym.mujoco.verify.poses import TRIES, random_pose, reach_contact
 from torchrl_sym.mujoco.verify.remembered import Remembered
 from torchrl_sym.mujoco.verify.states import PhysicsState, image_of, read_state, write_state
 from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Pose, Subject
@@ -39,8 +39,7 @@ class PhysicsSubject(Subject):
     ) -> None:
         super().__init__(observe)
         self.owner, self.model, self.memory = owner, model, memory
-        place = {} if pose.axis is None else {"axis": pose.axis}
-        self.robot = derive(model, group, pose.keyframe, carried=pose.carried, **place)
+        self.robot = derive(model, group, pose.keyframe, carried=pose.carried, axis=pose.axis)
 
     @property
     @abc.abstractmethod
@@ -77,8 +76,7 @@ class PhysicsSubject(Subject):
     @functools.cached_property
     def disturbances(self) -> Disturbances:
         """What may be added to forces and readings."""
-        pose = random_pose(self.model, self.state(), torch.Generator().manual_seed(0), KINDS - 1)
-        return Disturbances(self.robot, pose, self.transform)
+        return Disturbances(self.robot)
 
     def disturb(self, state: PhysicsState, generator: torch.Generator) -> PhysicsState:
         return dataclasses.replace(state, added=self.disturbances.draw(generator))

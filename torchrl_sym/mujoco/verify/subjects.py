@@ -28,7 +28,7 @@ class Pose:
     """Where and how `derive` looks for a symmetry; its arguments."""
 
     keyframe: int | str | None = None
-    axis: Sequence[float] | None = None
+    axis: tuple[float, float] | None = None
     carried: Sequence[str] = ()
 
 
