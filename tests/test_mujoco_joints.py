@@ -79,11 +79,17 @@ def test_joints_keep_their_order_unless_they_commute(name):
         assert worst_step(hips(left, right), MIRROR) <= 1e-9
 
 
+NEARLY = ("0 0 1", ".01 0 1")
+
+
 def test_hinges_on_one_line_go_to_each_other_in_order():
     wrist = hinge("yaw", "0 0 1") + Y + hinge("roll", "0 0 1")  # first and last are one line at zero
     table = derive(hips(wrist, wrist), MIRROR).table("joint", 1)
     assert table["yaw_left"] == "-yaw_right"
     assert table["roll_left"] == "-roll_right"
+    # nearer crosswise, by a hair: the order decides
+    wrists = (f"{hinge('yaw', one)}{Y}{hinge('roll', other)}" for one, other in (NEARLY, NEARLY[::-1]))
+    assert derive(hips(*wrists), MIRROR).table("joint", 1)["yaw_left"] == "-yaw_right"
 
 
 BASE = """<body name="base" pos="0 0 .5">{}<geom type="cylinder" size=".2 .05"/></body>"""
@@ -108,8 +114,8 @@ def test_a_little_out_of_order_is_told_to_the_audit():
 # --- slides that mix
 
 ARMS = "".join(
-    f"""<frame euler="0 0 {2 * np.pi * k / 3}">
-      <body name="arm{k}" pos=".2 0 0"><joint name="arm{k}" axis="0 1 0"/>
+    f"""<frame euler="0 0 {2 * np.pi * k / 3}"><body name="arm{k}" pos=".2 0 0">
+      <joint name="arm{k}" axis="0 1 0"/>
       <geom type="capsule" fromto="0 0 0 .1 .05 -.2" size=".02"/></body></frame>"""
     for k in range(3)
 )

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from tensordict import NestedKey
 
 from torchrl_sym.entries import Exchanged, opposites

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.infer.columns import Classes, Flags, classes_of, matches
