@@ -80,7 +80,7 @@ class Places:
                 owner = int(parents[owner])
             return owner == body
 
-        return [g for g in active if inside(int(owners[g]))]
+        return [g for g in self._active if inside(int(owners[g]))]
 
     def frame(self, one: Object | None, other: Object | None) -> Array:
         """The matrix V between the frames of two objects; R itself for the world's."""
