@@ -1,8 +1,9 @@
-"""Declare the symmetry of your own environment: derive the signs, audit the model, verify the declaration.
+"""The symmetry of your own environment: audit the model, infer the representations, verify them.
 
 The environment is dm_control's swing-up cart-pole. Its mirror plane sends the cart to the other side and
-the pole with it. `derive` reads from the model which joints change sign; the observation is declared with
-that; `verify` steps the simulator from mirrored states and says which entry is wrong, if one is.
+the pole with it. `infer` observes states and their images in the simulator and finds from these how every
+entry transforms; `code()` is what one would have written by hand. `verify` steps the simulator from
+mirrored states and says which entry is wrong, if one is: as in the declaration at the end.
 """
 
 import warnings
@@ -11,8 +12,8 @@ from dm_control import suite
 from torchrl.envs.libs.dm_control import DMControlWrapper
 
 from torchrl_sym import PointGroup, Symmetry
-from torchrl_sym.mujoco import audit, derive, verify
-from torchrl_sym.representations import pseudoscalar, scalar
+from torchrl_sym.mujoco import audit, derive, infer, verify
+from torchrl_sym.representations import scalar
 
 warnings.filterwarnings("ignore", module="glfw")  # it looks for a display, which nothing here needs
 
@@ -24,23 +25,17 @@ robot = derive(model, group)
 print(robot)  # where every joint and actuator goes, with its sign
 print(f"\nthe model's symmetry is {audit(model, group).verdict}\n")
 
-same, sign = scalar(group), pseudoscalar(group)
-symmetry = Symmetry(
-    group,
-    {
-        "position": robot.joints(["slider"]) + same + sign,  # cart x; cos and sin of the pole's angle
-        "velocity": robot.joint_velocities,  # of cart and pole
-        "action": robot.actuators,  # force on the cart
-    },
-)
+symmetry = infer(env, group)
+print(symmetry)  # every entry, and what becomes it under each element
+print(f"\n{symmetry.code()}")  # the same as a declaration, to be pasted and reviewed
 symmetry.check_specs(DMControlWrapper(env))  # every observation is declared, sizes fit, boxes are symmetric
 print(verify(env, symmetry))
 
 wrong = Symmetry(
     group,
     {
-        "position": robot.joints(["slider"]) + same + same,  # the sine should change sign
-        "velocity": robot.joint_velocities,
+        "position": robot.joints(["slider"]) + scalar(group) * 2,  # the pole's sine should change sign
+        "velocity": symmetry["velocity"],
         "action": robot.actuators,
     },
 )

@@ -37,7 +37,7 @@ def table(group: PointGroup, parts: Parts, labels: Labels | None = None) -> str:
     lines = [f"Symmetry under {', '.join(group.names)}"]
     for keys, representation in parts:
         names = _labels(keys, representation, labels)
-        lines += ["", f"{' and '.join(map(_shown, keys))}: {representation.dim} entries"]
+        lines += ["", f"{' and '.join(map(_shown, keys))}: {_count(representation.dim)}"]
         rows = [["", "", *group.names[1:]]]
         for segment in segments(representation, names):
             rows.append([_span(segment), segment.builder])
@@ -73,7 +73,10 @@ def code(group: PointGroup, parts: Parts, strict: bool = True, labels: Labels | 
     symmetry = f"symmetry = Symmetry(\n    group,\n    {{\n{body}    }},\n{options})"
     imports = f"from torchrl_sym import {', '.join(names)}\n"
     used = sorted(writer.used, key=lambda name: (name[0].islower(), name))
-    imports += f"from torchrl_sym.representations import {', '.join(used)}\n"
+    line = f"from torchrl_sym.representations import {', '.join(used)}"
+    if len(line) > _WIDTH:
+        line = f"from torchrl_sym.representations import (\n    {_wrapped(used, 4).strip()},\n)"
+    imports += f"{line}\n"
     if "torch." in made + symmetry:
         imports = "import torch\n\n" + imports
     return f"{imports}\n{made}\n{symmetry}"
@@ -209,7 +212,11 @@ def _sources(representation: Representation, i: int) -> list[str]:
 
 def _term(j: int, w: float, first: bool) -> str:
     sign = ("-" if w < 0 else "") if first else ("- " if w < 0 else "+ ")
-    return f"{sign}{j}" if abs(w) == 1 else f"{sign}{abs(w):.3g}*{j}"
+    return f"{sign}[{j}]" if abs(w) == 1 else f"{sign}{abs(w):.3g} [{j}]"
+
+
+def _count(entries: int) -> str:
+    return "1 entry" if entries == 1 else f"{entries} entries"
 
 
 def _span(segment: Segment, stop: int | None = None) -> str:

@@ -1,4 +1,4 @@
-"""A representation cut into the pieces that a person would have added up, each with the name of its builder.
+"""A representation cut into the pieces that a person would have added up, each with its builder's name.
 
 Pieces are found by trying builders on consecutive entries: vectors, quaternions, joints that change
 places, items. Several sums may describe one representation, so the pieces are a reading, not the only one;
@@ -58,13 +58,13 @@ class Segment:
 
 _Named = tuple[str, str, Callable[[PointGroup], Representation]]
 _VECTORS: tuple[_Named, ...] = (
-    ("rotation_matrix", "", lambda group: rotation_matrix(group).flatten()),
-    ("quaternion", '"conjugate"', lambda group: quaternion(group, "conjugate")),
-    ("quaternion", "", quaternion),
     ("polar", "", polar),
     ("axial", "", axial),
+    ("quaternion", '"conjugate"', lambda group: quaternion(group, "conjugate")),
+    ("quaternion", "", quaternion),
     ("planar", "", planar),
     ("heading", "", heading),
+    ("rotation_matrix", "", lambda group: rotation_matrix(group).flatten()),
 )
 _NUMBERS: tuple[_Named, ...] = (("scalar", "", scalar), ("pseudoscalar", "", pseudoscalar))
 
@@ -131,21 +131,29 @@ class _Reader:
         return items or Segment(start, matrices, "signed_permutation")
 
     def vector(self, start: int) -> Segment | None:
-        """A vector, quaternion, ... that begins here."""
-        for name, arguments, wanted in self.vectors:
+        """A vector, quaternion, ... that begins here: one of all that is of one thing, or the first."""
+        whole = self.extent(start)
+        exact = [v for v in self.vectors if v[2].shape[-1] == whole]
+        for name, arguments, wanted in (*exact, *self.vectors):
             stop = start + wanted.shape[-1]
-            if stop not in self.ends or not self.one_thing(start, stop):
+            if stop not in self.ends or (whole is not None and stop > start + whole):
+                continue
+            if name == "rotation_matrix" and not exact:
                 continue
             found = self.matrices(start, stop)
             if (found - wanted).abs().max() < _CLOSE:
                 return Segment(start, found, name, arguments)
         return None
 
-    def one_thing(self, start: int, stop: int) -> bool:
-        """Whether labels allow that entries are parts of one thing: ``root[0]``, ``root[1]``, or none."""
-        names = self.labels[start:stop]
-        stems = {name.removeprefix("-").rpartition("[")[0] for name in names}
-        return not any(names) or (all(names) and len(stems) == 1 and stems != {""})
+    def extent(self, start: int) -> int | None:
+        """How many entries from here are of one thing, ``root[0]``, ``root[1]``; None if unknown."""
+        stems = [_stem(name) for name in self.labels[start:]]
+        if not self.labels[start]:
+            named = next((i for i, name in enumerate(self.labels[start:]) if name), None)
+            return named  # what has a name is something else
+        return (
+            next((i for i, stem in enumerate(stems) if stem is None or stem != stems[0]), len(stems)) or 1
+        )
 
     def run(self, start: int) -> Segment:
         """As many single entries as go together: scalars, or signs, up to the next vector."""
@@ -168,6 +176,8 @@ class _Reader:
     def items(self, start: int, matrices: Tensor) -> Segment | None:
         """Items that change places, each a sum of vectors."""
         size = matrices.shape[-1]
+        if all(name and _stem(name) is None for name in self.labels[start : start + size]):
+            return None  # each has a name of its own
         for value in (k for k in range(9, 1, -1) if size >= _ITEMS and size % k == 0):
             places, each = factors(matrices, value)
             whole = torch.stack([torch.kron(p, v) for p, v in zip(places, each, strict=True)])
@@ -183,6 +193,12 @@ def factors(matrices: Tensor, value: int) -> tuple[Tensor, Tensor]:
     source = places[:, 0].argmax(-1)
     each = torch.stack([block[0, j] for block, j in zip(blocks, source.tolist(), strict=True)])
     return places, each
+
+
+def _stem(label: str) -> str | None:
+    """The thing that ``root[2]`` is a part of; None of what has no parts."""
+    name, bracket, _ = label.removeprefix("-").rpartition("[")
+    return name if bracket else None
 
 
 def _is_signed_permutation(matrices: Tensor) -> bool:

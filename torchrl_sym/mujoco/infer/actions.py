@@ -8,6 +8,7 @@ actions move something else (a mocap body, forces), the same holds of the next s
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.infer.columns import Flags
 from torchrl_sym.mujoco.infer.errors import InferenceError, Unexplained
 from torchrl_sym.mujoco.infer.mixing import polished
 from torchrl_sym.mujoco.infer.samples import box_of, random_action
@@ -22,7 +24,8 @@ from torchrl_sym.mujoco.model.types import Array, name_of
 from torchrl_sym.mujoco.verify.subjects import Subject
 from torchrl_sym.representations import Representation
 
-_STATES = 3  # states in which every action is tried
+_STATES = 2  # states in which every action is tried
+_STILL = 1e-9  # change that is no more than rounding
 _STEP = 0.25  # of the way from the middle of the box to its end
 _ORTHOGONAL = 1e-3  # distance from orthogonal that is still taken for noise
 _CLIPPED = 1e-6  # relative difference of controls that counts
@@ -56,15 +59,17 @@ class ActionFinder:
         if not self.size:
             raise InferenceError("'action': expected actions, got none; there is nothing to transform")
         starts = [self._start(i) for i in range(_STATES)]
-        for of_controls in (True, False):
-            effects = self._effects(starts, of_controls)
-            if effects is None:
-                continue
-            size = np.linalg.norm(effects[0][0], axis=0)
-            self.still = np.flatnonzero(size <= 1e-9 * max(float(size.max()), 1e-9)).tolist()
-            if not self.still or not of_controls:
-                return self._solved(starts, effects, of_controls)
-        raise InferenceError("'action': no action can be followed; " + _REMEDY)
+        controls = self._effects(starts, True, range(self.group.order))
+        moved = None if controls is None else _moves(controls[0][0])
+        if controls is not None and moved is not None and not moved.all():
+            other = self._effects(starts, False, [0])  # do the rest move anything else?
+            if other is not None and (_moves(other[0][0]) & ~moved).any():
+                controls = None
+        effects = controls or self._effects(starts, False, range(self.group.order))
+        if effects is None:
+            raise InferenceError("'action': no action can be followed; " + _REMEDY)
+        self.still = np.flatnonzero(~_moves(effects[0][0])).tolist()
+        return self._solved(starts, effects, controls is not None)
 
     def labels(self) -> list[str]:
         """Names of the actuators, where there is one for each action."""
@@ -97,11 +102,13 @@ class ActionFinder:
             parts += [x.flatten(1) for x in moved if x is not None]
         return torch.cat(parts, 1).flatten() if parts else None
 
-    def _effects(self, starts: list[Any], of_controls: bool) -> list[tuple[Array, Array]] | None:
+    def _effects(
+        self, starts: list[Any], of_controls: bool, elements: Iterable[int]
+    ) -> list[tuple[Array, Array]] | None:
         """For each element: E(L_g s), and the image of E(s); None if nobody knows the image."""
         out = []
         tried = [self._tried(state, of_controls) for state in starts]
-        for g in range(self.group.order):
+        for g in elements:
             there, here = [], []
             for state, before in zip(starts, tried, strict=True):
                 after = before if g == 0 else self._tried(self.subject.transform(state, g), of_controls)
@@ -179,3 +186,9 @@ class ActionFinder:
             for g, i in np.argwhere(gap > 10 * _ORTHOGONAL)
         ]
         raise InferenceError(f"'action' does not transform orthogonally; {_REMEDY}:", faults)
+
+
+def _moves(effects: Array) -> Flags:
+    """Which actions make a difference, by the columns of their effects."""
+    size = np.linalg.norm(effects, axis=0)
+    return size > _STILL * max(float(size.max(initial=0.0)), 1.0)

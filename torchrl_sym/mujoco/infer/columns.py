@@ -10,9 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_sym.mujoco.model.types import Array
 
+Flags = NDArray[np.bool_]
 TINY = 1e-9  # no more than rounding: an entry that is never larger is zero
 
 
@@ -63,7 +65,7 @@ class Classes:
 
     members: list[list[int]]
     sign: Array
-    constant: Array
+    constant: Flags
 
 
 def classes_of(data: Array, rounding: Array) -> Classes:

@@ -1,8 +1,8 @@
 """Infer how observations and actions transform, from the simulator itself.
 
-`derive` knows the image L_g s of every state s of a model. What an environment makes of a state is its own
-affair: a subset of joints, a torso's frame, forces on feet, last actions. So it is asked: observe s, observe
-L_g s, and solve obs(L_g s) = rho(g) obs(s) for rho, over many states. Nothing has to be declared by hand.
+`derive` knows the image L_g s of every state s of a model. What an environment makes of a state is its
+own affair: a subset of joints, a torso's frame, forces on feet, last actions. So it is asked: observe s,
+observe L_g s, and solve obs(L_g s) = rho(g) obs(s) for rho, over many states. Nothing is declared by hand.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def infer(
     group: PointGroup,
     *,
     keyframe: int | str | None = None,
-    axis: Sequence[float] | None = None,
+    axis: tuple[float, float] | None = None,
     carried: Sequence[str] = (),
     memory: Mapping[str, Representation] | Remembered | None = None,
     observe: Callable[[Any], Any] | None = None,
@@ -45,9 +45,10 @@ def infer(
 
     The simulator is put into random states s and their images L_g s (:func:`~torchrl_sym.mujoco.derive`
     knows them), both are observed, and the representation of every key is solved for: signed permutations,
-    orthogonal mixtures where entries are turned, constants to themselves. Episodes of mirrored actions reach
-    what an environment remembers beside MuJoCo's state, such as last actions and histories, also in
-    wrappers. A third of the states is held out, and the result is checked on them.
+    orthogonal mixtures where entries are turned, constants to themselves. Episodes of mirrored actions
+    reach what an environment remembers beside MuJoCo's state, such as last actions and histories, also in
+    wrappers. Contact forces are exercised by random additions to them. A third of the states is held out,
+    and the result is checked on them.
 
     Args:
         env: a gymnasium environment around MuJoCo (with wrappers, also of goals), a dm_control

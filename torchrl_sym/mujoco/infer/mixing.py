@@ -11,6 +11,7 @@ import itertools
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.infer.columns import Flags
 from torchrl_sym.mujoco.model.types import Array
 
 _ROOTS = np.sqrt([0.0, 0.25, 0.5, 0.75, 1.0])  # sines of the angles that most groups turn by
@@ -19,7 +20,7 @@ _INDEPENDENT = 1e-4  # smallest singular value, of columns of unit length
 _WINDOWS = (2, 3, 4, 6, 9)  # entries of planar vectors, vectors, quaternions, two of them, rotations
 
 
-def least_squares(data: Array, images: Array, margin: Array) -> tuple[Array, Array]:
+def least_squares(data: Array, images: Array, margin: Array) -> tuple[Array, Flags]:
     """Matrices ``(N, k, k)`` with ``images[g] = data @ matrices[g].T``, and which rows have none.
 
     Args:

@@ -8,8 +8,9 @@ import numpy as np
 import torch
 from tensordict import NestedKey
 
-from torchrl_sym.entries import Exchanged
+from torchrl_sym.entries import Exchanged, opposites
 from torchrl_sym.groups import PointGroup
+from torchrl_sym.mujoco.infer.columns import Flags
 from torchrl_sym.mujoco.infer.errors import InferenceError
 from torchrl_sym.mujoco.infer.quantities import labels_of, names_of
 from torchrl_sym.mujoco.infer.samples import Sampler, Samples
@@ -57,7 +58,7 @@ class ObservationFinder:
                 break
             known = self.samples.count
             self.sampler.draw(known)
-            if number == 0:
+            if number == 0 and not self.sampler.subject.whole:
                 self.sampler.draw_patiently()
         names, quantities = names_of(self.sampler.subject), self.samples.quantities
         assert quantities is not None
@@ -78,7 +79,7 @@ class ObservationFinder:
         """Largest value of each entry."""
         return np.maximum(self.samples.values[key].abs().amax(dim=(0, 1)).numpy(), 1e-6)
 
-    def hidden(self, key: NestedKey) -> Array:
+    def hidden(self, key: NestedKey) -> Flags:
         """Entries that differ between two observations of one state, ``(d,)`` bool."""
         return self.samples.hidden[key].numpy() > self.margin(key)
 
@@ -92,7 +93,7 @@ class ObservationFinder:
 
     def _solutions(self, known: int) -> dict[Keys, Solution]:
         """One for each key; those of keys that have none by themselves together, if that helps."""
-        found = {(key,): self._solve((key,), known) for key in self.samples.values}
+        found = {keys: self._solve(keys, known) for keys in self._sides()}
         alone = [keys for keys, solution in found.items() if not solution.complete]
         if len(alone) < 2:
             return found
@@ -100,10 +101,21 @@ class ObservationFinder:
         joint = self._solve(together, known)
         for keys in _exchanged(joint, [self.samples.values[key].shape[-1] for key in together], together):
             if len(keys) > 1 and (part := self._solve(keys, known)).complete:
-                for key in keys:
-                    del found[key,]
-                found[keys] = part
+                found = {old: s for old, s in found.items() if old[0] not in keys} | {keys: part}
         return found
+
+    def _sides(self) -> list[Keys]:
+        """Each key by itself; those named after sides that an element exchanges together."""
+        keys = list(self.samples.values)
+        turned = self.group.matrices.diagonal(dim1=-2, dim2=-1) < -1 + 1e-9
+        pairs = [(a, b) for a, b, axis in opposites(keys) if turned[:, axis].any()]
+        owner = {key: key for key in keys}
+        for a, b in pairs:
+            old, new = owner[b], owner[a]
+            owner = {key: new if first == old else first for key, first in owner.items()}
+        return [
+            tuple(key for key in keys if owner[key] == first) for first in dict.fromkeys(owner.values())
+        ]
 
     def _solve(self, keys: Keys, known: int) -> Solution:
         """From the samples known, checked on the rest."""

@@ -72,9 +72,10 @@ def _coordinates(model: MjModel, kind: str, words: str) -> list[str]:
 
 def _split(model: MjModel, kind: str, starts: Any, words: str) -> list[str]:
     """A name for every value, of things of which each has the values from its start to the next."""
+    count = {"actuator": getattr(model, "nactuator", model.nu)}.get(kind, len(starts))  # one may have more
     names = []
     for i, (start, end) in enumerate(itertools.pairwise(starts)):
-        name = words.format(name_of(model, kind, i))
+        name = words.format(name_of(model, kind, i) if i < count else f"{kind} {i}")
         names += [name] if end - start == 1 else [f"{name}[{k}]" for k in range(end - start)]
     return names
 

@@ -25,9 +25,10 @@ def refuse(finder: ObservationFinder) -> None:
     hidden = _hidden(finder)
     if hidden:
         raise InferenceError(
-            "one state is observed in two ways: the environment remembers something that MuJoCo's state does "
-            "not hold and an episode does not repeat (a command, a target, a phase), or draws noise. Hand it "
-            "over with infer(..., memory=...), switch the noise off, or drop the entries with observe=...:",
+            "one state is observed in two ways: the environment remembers something that MuJoCo's state "
+            "does not hold and an episode does not repeat (a command, a target, a phase), or draws noise. "
+            "Hand it over with infer(..., memory=...), switch the noise off, or drop the entries with "
+            "observe=...:",
             [*hidden, *failed],
             partial,
         )
@@ -59,14 +60,14 @@ def _refuse_untested(finder: ObservationFinder) -> None:
     if forces:
         raise InferenceError(
             f"contact forces or flags that nothing reached: {'; '.join(forces)} never changed in "
-            f"{samples.count} states, but depend on them. Take more samples=..., starts in which these parts "
-            "touch, or drop the entries with observe=..."
+            f"{samples.count} states, but depend on them. Take more samples=..., starts in which these "
+            "parts touch, or drop the entries with observe=..."
         )
     if still and not samples.contacts and can_touch(subject.model):
         raise InferenceError(
             f"contact was never reached in {samples.count} states, and entries of "
-            f"{', '.join(map(_name, still))} never changed: contact forces or flags look like this. Take more "
-            "samples=..., starts nearer to the ground, or drop the entries with observe=..."
+            f"{', '.join(map(_name, still))} never changed: contact forces or flags look like this. Take "
+            "more samples=..., starts nearer to the ground, or drop the entries with observe=..."
         )
 
 
@@ -95,14 +96,14 @@ def notes_on(finder: ObservationFinder) -> list[str]:
         rough = np.flatnonzero(solution.off > _ROUGH).tolist()
         if rough:
             notes.append(
-                f"{_name(keys)} {ranges(rough)} agree with their images to {solution.off.max():.1g} only: a "
-                "solver that stops early, contacts, or small asymmetries of the model"
+                f"{_name(keys)} {ranges(rough)} agree with their images to {solution.off.max():.1g} only: "
+                "a solver that stops early, contacts, or small asymmetries of the model"
             )
         if solution.twins:
             groups = "; ".join(ranges(members) for members in solution.twins[:_SHOWN])
             more = f" and {len(solution.twins) - _SHOWN} more" if len(solution.twins) > _SHOWN else ""
             notes.append(
-                f"{_name(keys)}: {groups}{more} always agree up to a sign, so that several permutations fit; "
+                f"{_name(keys)}: {groups}{more} always agree up to a sign: several permutations fit; "
                 "each stays if it can, or keeps its rank among them"
             )
     return notes

@@ -23,7 +23,7 @@ from torchrl_sym.mujoco.verify.subjects import Observation, Subject
 from torchrl_sym.representations import Representation
 
 SHORT, LONG, LAST = 4, 12, 8  # steps of most episodes, of every fourth; how many of a patient one are kept
-PATIENT = 100  # steps of an episode in search of entries that have not changed yet
+PATIENT = 60  # steps of an episode in search of entries that have not changed yet
 LOOKED_AT = 4  # rows of a batch in which contacts are counted
 
 

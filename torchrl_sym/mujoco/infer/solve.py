@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from torchrl_sym.groups import PointGroup
-from torchrl_sym.mujoco.infer.columns import Classes, classes_of, matches
+from torchrl_sym.mujoco.infer.columns import Classes, Flags, classes_of, matches
 from torchrl_sym.mujoco.infer.mixing import least_squares, polished
 from torchrl_sym.mujoco.model.types import Array
 
@@ -35,13 +35,13 @@ class Solution:
     """
 
     matrices: Array
-    failed: Array
+    failed: Flags
     reasons: dict[tuple[int, int], str] = field(default_factory=dict)
-    constant: Array = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    constant: Flags = field(default_factory=lambda: np.zeros(0, dtype=bool))
     twins: list[list[int]] = field(default_factory=list)
     events: Array = field(default_factory=lambda: np.zeros(0, dtype=int))
     off: Array = field(default_factory=lambda: np.zeros(0))
-    surprised: Array = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    surprised: Flags = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     @property
     def complete(self) -> bool:
@@ -91,7 +91,7 @@ def _events(samples: Array, rounding: Array) -> Array:
 
 def _reduced(
     group: PointGroup, data: Array, images: Array, margin: Array, rounding: Array
-) -> tuple[Array, Array]:
+) -> tuple[Array, Flags]:
     """Matrices on one entry of each class, and which rows have none."""
     order, size = len(images), data.shape[1]
     matrices, failed = np.zeros((order, size, size)), np.zeros((order, size), dtype=bool)
@@ -112,22 +112,23 @@ def _reduced(
         mixed |= more
 
     if mixed:
-        places = sorted(mixed)
+        places = np.array(sorted(mixed))
         part, wrong = least_squares(data[:, places], images[:, :, places], margin[places])
         part, wrong = _orthogonal(group, part, wrong)
         off = np.abs(images[:, :, places] - np.einsum("nk,gik->gni", data[:, places], part)).max(axis=1)
         wrong |= off > margin[places]
         matrices[:, places] = 0.0
-        matrices[np.ix_(range(order), places, places)] = np.where(wrong[..., None], 0.0, part)
+        matrices[np.ix_(np.arange(order), places, places)] = np.where(wrong[..., None], 0.0, part)
         failed[:, places] = wrong
     return matrices, failed
 
 
-def _orthogonal(group: PointGroup, matrices: Array, wrong: Array) -> tuple[Array, Array]:
+def _orthogonal(group: PointGroup, matrices: Array, wrong: Flags) -> tuple[Array, Flags]:
     """Make nearly orthogonal matrices so; rows of blocks that are not are wrong, too."""
-    touched = (np.abs(matrices) > 0).any(axis=0)
-    label = np.arange(len(touched))
-    linked = touched | touched.T | np.eye(len(touched), dtype=bool)
+    size = matrices.shape[-1]
+    touched = np.asarray((np.abs(matrices) > 0).any(axis=0))
+    label = np.arange(size)
+    linked = touched | touched.T | np.eye(size, dtype=bool)
     while True:
         smallest = np.where(linked, label, len(label)).min(axis=1)
         if (smallest == label).all():
@@ -136,18 +137,18 @@ def _orthogonal(group: PointGroup, matrices: Array, wrong: Array) -> tuple[Array
     out, wrong = matrices.copy(), wrong.copy()
     for first in np.unique(label):
         block = np.flatnonzero(label == first)
-        part = matrices[np.ix_(range(len(matrices)), block, block)]
+        part = matrices[np.ix_(np.arange(len(matrices)), block, block)]
         gap = np.abs(part @ part.swapaxes(1, 2) - np.eye(len(block))).max()
         if wrong[:, block].any() or gap > _ORTHOGONAL:
             wrong[1:, block] |= (
                 np.abs(part @ part.swapaxes(1, 2) - np.eye(len(block))).max(axis=2) > _ORTHOGONAL
             )[1:]
         else:
-            out[np.ix_(range(len(matrices)), block, block)] = polished(group, part)
+            out[np.ix_(np.arange(len(matrices)), block, block)] = polished(group, part)
     return out, wrong
 
 
-def _expand(classes: Classes, reduced: Array, failed: Array, found: Solution) -> None:
+def _expand(classes: Classes, reduced: Array, failed: Flags, found: Solution) -> None:
     """From one entry of each class to all: the k-th goes to the k-th."""
     members, sign = classes.members, classes.sign
     for g, i in np.argwhere(failed):

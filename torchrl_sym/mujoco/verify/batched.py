@@ -18,6 +18,8 @@ from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Subject
 class BatchedSubject(Subject):
     """A batched task environment: `reset_to`, `state` and `task.transform_state`."""
 
+    whole = True
+
     def __init__(self, env: Any, observe: Callable[[Any], Any] | None, seed: int) -> None:
         super().__init__(observe)
         self.env, self.model, self.rows = env, env.task.model, env.batch_size[0]

@@ -64,7 +64,12 @@ class ComposerSubject(ControlSubject):
         return self.entries(updater.get_observation())
 
     def reset(self) -> Observation:
-        self.env.reset()
+        compiles = self.env._recompile_mjcf_every_episode
+        self.env._recompile_mjcf_every_episode = False  # which takes longer than all that is asked here
+        try:
+            self.env.reset()
+        finally:
+            self.env._recompile_mjcf_every_episode = compiles
         model = self.env.physics.model.ptr
         if (model.nq, model.nv, model.nu, model.nbody) != (
             *(self.model.nq, self.model.nv),

@@ -8,8 +8,6 @@ and torques axial vectors on bodies that change places, sensors are mapped by `d
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,11 +15,11 @@ import torch
 from torch import Tensor
 
 from torchrl_sym.mujoco.derive import ModelSymmetry
-from torchrl_sym.mujoco.model.types import Array, MjModel, mj
+from torchrl_sym.mujoco.model.types import Array, MjModel, mj, name_of
 from torchrl_sym.representations import Representation
 
-_CLOSE = 1e-2  # of the model's extent: how far a body's image may be from where its place goes
-_SAME = 1e-5  # m: bodies no farther apart are at one place
+_KINDS = ("TOUCH", "FORCE", "TORQUE", "CONTACT", "TACTILE")
+_CONTACT = [kind for name in _KINDS if (kind := getattr(mj.mjtSensor, f"mjSENS_{name}", None)) is not None]
 _SIZE = 0.5  # largest number that is added: environments clip forces at 1
 
 
@@ -30,12 +28,11 @@ class Disturbances:
 
     Args:
         robot: the symmetry of the model.
-        poses: states in which bodies are told apart, at least one, with their images by element.
     """
 
-    def __init__(self, robot: ModelSymmetry, pose: Any, transform: Callable[[Any, int], Any]) -> None:
+    def __init__(self, robot: ModelSymmetry) -> None:
         self.robot, self.group = robot, robot.group
-        self.bodies = _body_images(robot, pose, transform)
+        self.bodies = _body_images(robot)
         try:
             self.sensors: Representation | None = robot.sensordata if robot.model.nsensor else None
         except ValueError:  # some reading has no linear image
@@ -45,7 +42,7 @@ class Disturbances:
         """Additions to ``cfrc_ext`` and ``sensordata``, by these names, a row each."""
         model = self.robot.model
         force = _SIZE * (2 * torch.rand(1, model.nbody, 6, generator=generator, dtype=torch.float64) - 1)
-        force[:, (self.bodies < 0).any(axis=0)] = 0.0
+        force[:, np.flatnonzero((self.bodies < 0).any(axis=0))] = 0.0
         out = {"cfrc_ext": force}
         if self.sensors is not None:
             size = (1, model.nsensordata)
@@ -54,10 +51,13 @@ class Disturbances:
 
     @staticmethod
     def anything(model: MjModel, generator: torch.Generator) -> dict[str, Tensor]:
-        """Additions to everything, whether or not their images are known."""
+        """Additions to all that contact makes, whether or not their images are known."""
         sizes = {"cfrc_ext": (1, model.nbody, 6), "sensordata": (1, model.nsensordata)}
         draws = {k: torch.rand(x, generator=generator, dtype=torch.float64) for k, x in sizes.items()}
-        return {name: _SIZE * (0.5 + draw) for name, draw in draws.items()}
+        out = {name: _SIZE * (0.5 + draw) for name, draw in draws.items()}
+        felt = np.isin(model.sensor_type, [int(kind) for kind in _CONTACT])
+        out["sensordata"] *= torch.as_tensor(np.repeat(felt, model.sensor_dim))
+        return out
 
     def image(self, added: dict[str, Tensor], g: int) -> dict[str, Tensor]:
         """Images of what was drawn."""
@@ -80,40 +80,9 @@ class Disturbances:
             getattr(data, name)[:] += values[0].numpy()
 
 
-def _places(model: MjModel, state: Any) -> Array:
-    """Places of frame and centre of mass of every body, ``(nbody, 6)``."""
-    from torchrl_sym.mujoco.verify.states import write_state
-
-    data = mj.MjData(model)
-    write_state(data, state)
-    mj.mj_kinematics(model, data)
-    return np.concatenate([data.xpos, data.xipos], axis=1)
-
-
-def _body_images(robot: ModelSymmetry, pose: Any, transform: Callable[[Any, int], Any]) -> Array:
-    """Image of every body under every element, ``(N, nbody)``; -1 where it is not clear."""
-    model, group = robot.model, robot.group
-    here = _places(model, pose)
-    out = np.full((group.order, model.nbody), -1)
-    axis = np.array([*getattr(robot, "axis", (0.0, 0.0)), 0.0])
-    for g in range(group.order):
-        turn = group.matrices[g].numpy()
-        there = _places(model, transform(pose, g))
-        moved = np.concatenate([(x - axis) @ turn.T + axis for x in (here[:, :3], here[:, 3:])], axis=1)
-        off = np.linalg.norm(moved[:, None] - there, axis=2)
-        nearest = off.min(axis=1, keepdims=True)
-        near = (off <= nearest + _SAME) & (nearest < _CLOSE * float(model.stat.extent))
-        near &= np.abs(model.body_mass[:, None] - model.body_mass) <= 0.1 * model.body_mass.max() + 1e-9
-        # several bodies at one place: the k-th of them goes to the k-th
-        for places, bodies in itertools.groupby(range(model.nbody), key=lambda b: near[b].tobytes()):
-            mine, theirs = list(bodies), np.flatnonzero(np.frombuffer(places, dtype=bool))
-            if len(mine) == len(theirs):
-                out[g, mine] = theirs
-    out[0] = np.arange(model.nbody)
-    while True:  # bodies are known if all that they are exchanged with are
-        known = (out >= 0).all(axis=0)
-        for row in out:
-            known &= known[row] & (np.bincount(row[row >= 0], minlength=model.nbody)[row] == 1)
-        if known[(out >= 0).all(axis=0)].all():
-            return out
-        out[:, ~known] = -1
+def _body_images(robot: ModelSymmetry) -> Array:
+    """Image of every body under every element, ``(N, nbody)``; -1 where there is none."""
+    model = robot.model
+    number = {name_of(model, "body", b): b for b in range(model.nbody)}
+    tables = [robot.table("body", g) for g in range(robot.group.order)]
+    return np.array([[number.get(table[name], -1) for name in number] for table in tables])

@@ -82,7 +82,7 @@ class GymnasiumSubject(PhysicsSubject):
             self.put(state)
             return observed(self.base), info
 
-        return self.entries(self._through("reset", reset, self.env.reset)[0])
+        return self.entries(self._through("reset", reset, lambda: self.env.reset())[0])
 
     def advance(self, action: Tensor, state: PhysicsState) -> Observation:
         inner = self.base.step

@@ -27,6 +27,8 @@ FLOAT32_TOLERANCE = 2e-6  # rounding of observations and rewards in single preci
 
 @dataclass
 class Trajectory:
+    """What followed from a state, after one step and after many."""
+
     start: Any  # states
     before: Observation
     first: Outcome

@@ -16,7 +16,7 @@ from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive import derive
 from torchrl_sym.mujoco.model.types import MjModel, mj
 from torchrl_sym.mujoco.verify.forces import Disturbances
-from torchrl_sym.mujoco.verify.poses import KINDS, TRIES, random_pose, reach_contact
+from torchrl_sym.mujoco.verify.poses import TRIES, random_pose, reach_contact
 from torchrl_sym.mujoco.verify.remembered import Remembered
 from torchrl_sym.mujoco.verify.states import PhysicsState, image_of, read_state, write_state
 from torchrl_sym.mujoco.verify.subjects import Observation, Outcome, Pose, Subject
@@ -39,8 +39,7 @@ class PhysicsSubject(Subject):
     ) -> None:
         super().__init__(observe)
         self.owner, self.model, self.memory = owner, model, memory
-        place = {} if pose.axis is None else {"axis": pose.axis}
-        self.robot = derive(model, group, pose.keyframe, carried=pose.carried, **place)
+        self.robot = derive(model, group, pose.keyframe, carried=pose.carried, axis=pose.axis)
 
     @property
     @abc.abstractmethod
@@ -63,11 +62,12 @@ class PhysicsSubject(Subject):
         data = self.data
         write_state(data, state)
         mj.mj_forward(self.model, data)
+        if self.memory:
+            self.memory.write(self.owner, state.memory)
+            mj.mj_forward(self.model, data)  # a target may be a place in the model
         mj.mj_rnePostConstraint(self.model, data)  # contact forces, which some observe
         data.qacc_warmstart[:] = state.qacc_warmstart[0].numpy()  # mj_forward replaced it
         Disturbances.add(data, state.added)
-        if self.memory:
-            self.memory.write(self.owner, state.memory)
 
     def transform(self, state: PhysicsState, g: int) -> PhysicsState:
         memory = self.memory.image(state.memory, g) if self.memory else {}
@@ -77,8 +77,7 @@ class PhysicsSubject(Subject):
     @functools.cached_property
     def disturbances(self) -> Disturbances:
         """What may be added to forces and readings."""
-        pose = random_pose(self.model, self.state(), torch.Generator().manual_seed(0), KINDS - 1)
-        return Disturbances(self.robot, pose, self.transform)
+        return Disturbances(self.robot)
 
     def disturb(self, state: PhysicsState, generator: torch.Generator) -> PhysicsState:
         return dataclasses.replace(state, added=self.disturbances.draw(generator))

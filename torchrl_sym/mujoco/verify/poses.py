@@ -107,6 +107,6 @@ def reach_contact(model: MjModel, state: PhysicsState, generator: torch.Generato
 
 
 def can_touch(model: MjModel) -> bool:
-    """Whether any two geoms collide when they meet: not those of one link, of parent and child, excluded."""
+    """Whether any two geoms collide when they meet: not of one link, of parent and child, or excluded."""
     filters = Filters(model)
     return bool(filters.may.any() or filters.pairs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -35,13 +36,12 @@ class PhysicsState:
 
     def rows(self, ids: slice) -> PhysicsState:
         """A copy."""
-        copies = {name: x[ids].clone() for name, x in vars(self).items() if isinstance(x, Tensor)}
-        return PhysicsState(**copies, time=self.time, memory=self.memory)
+        return dataclasses.replace(self, **{name: getattr(self, name)[ids].clone() for name in _FIELDS})
 
 
 def read_state(data: MjData, memory: dict[str, Any]) -> PhysicsState:
     """The state of a simulation, with what is remembered beside."""
-    rows = {name: torch.as_tensor(np.array(getattr(data, name)))[None] for name in _FIELDS}
+    rows: dict[str, Any] = {name: torch.as_tensor(np.array(getattr(data, name)))[None] for name in _FIELDS}
     return PhysicsState(**rows, time=float(data.time), memory=memory)
 
 

@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 from tensordict import NestedKey, TensorDictBase
+from tensordict.utils import unravel_key
 from torch import Tensor
 
 from torchrl_sym import checks
@@ -28,7 +29,7 @@ class Pose:
     """Where and how `derive` looks for a symmetry; its arguments."""
 
     keyframe: int | str | None = None
-    axis: Sequence[float] | None = None
+    axis: tuple[float, float] | None = None
     carried: Sequence[str] = ()
 
 
@@ -51,6 +52,7 @@ class Subject(abc.ABC):
         rows: number of simulations that step together.
         low: smallest action, ``(actions,)``; ``high`` likewise.
         hint: what else may be wrong if sizes do not fit.
+        whole: whether the state holds all that is remembered.
         searches: how many poses :meth:`touching` tries.
     """
 
@@ -59,6 +61,7 @@ class Subject(abc.ABC):
     low: Tensor
     high: Tensor
     hint = ""
+    whole = False
     searches = 0
 
     def __init__(self, observe: Callable[[Any], Any] | None) -> None:
@@ -125,7 +128,7 @@ class Subject(abc.ABC):
             return dict(observation.items(include_nested=True, leaves_only=True))
         if not isinstance(observation, Mapping):
             return {"observation": _row("observation", observation)}
-        return {key if len(key) > 1 else key[0]: _row(key, x) for key, x in _leaves(observation, ())}
+        return {unravel_key(key): _row(unravel_key(key), x) for key, x in _leaves(observation, ())}
 
 
 def _leaves(observation: Mapping[str, Any], above: tuple[str, ...]) -> list[tuple[tuple[str, ...], Any]]:

@@ -35,7 +35,7 @@ def verify(
     symmetry: Symmetry,
     *,
     keyframe: int | str | None = None,
-    axis: Sequence[float] | None = None,
+    axis: tuple[float, float] | None = None,
     carried: Sequence[str] = (),
     states: int = 16,
     steps: int = 10,
