@@ -68,9 +68,6 @@ def main(arguments: Arguments) -> int:
         print(text)
     else:
         write_whole(arguments.out, text)
-    for row in rows:
-        for complaint in row.against:
-            print(f"{row.key}: {complaint}", file=sys.stderr)
     return int(any(row.against for row in rows))
 
 

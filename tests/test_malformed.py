@@ -130,7 +130,7 @@ SUBJECTS = [
         ),
         names=optional(names(list(K4.names), ordered=True).but("one misspelt", "one text", text="abcd")),
     ),
-    subject("reflection", PointGroup.reflection, axis=choice("x", vertical="z")),
+    subject("reflection", PointGroup.reflection, axis=choice("x", vertical="z").but("a number")),
     subject("rotation", PointGroup.rotation, n=count(3, **{"too many": 121}, **blown)),
     subject("dihedral", PointGroup.dihedral, n=count(3, **{"too many": 121}, **blown)),
     subject(

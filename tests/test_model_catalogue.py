@@ -56,12 +56,20 @@ def test_left_and_right_are_paired_by_words_of_names(sides, name, image):
     assert expect(sides).image(image) == name
 
 
-def test_a_name_of_one_side_alone_stays_where_it_is():
+def test_names_without_a_side_stay_and_a_name_of_one_side_alone_may_go_anywhere():
     entry = expect([("left", "right")], reflect_y="exact")
-    assert entry.complaints({"reflect-y": "exact"}, {"left_camera": "left_camera", "neck": "neck"}) == []
+    assert entry.complaints({"reflect-y": "exact"}, {"left_camera": "eye_2", "neck": "neck"}) == []
     assert entry.complaints({"reflect-y": "exact"}, {"neck": "head", "head": "neck"}) == [
         "reflect-y: neck goes to head, expected neck",
         "reflect-y: head goes to neck, expected head",
+    ]
+
+
+def test_an_element_that_nobody_asks_for_is_judged_if_it_is_expected():
+    found = {"reflect-y": "no", "reflect-30": "approximate"}
+    assert expect().complaints(found, {}) == []
+    assert expect(**{"reflect-30": "exact"}).complaints(found, {}) == [
+        "reflect-30: expected exact, got approximate"
     ]
 
 

@@ -130,7 +130,7 @@ def test_a_tendon_that_drives_both_fingers_is_exact(coefficients, sign):
 # --- frames
 
 
-def swingers(sites: str, actuators: str) -> mujoco.MjModel:
+def swingers(sites: str, actuators: str, rest: str = "") -> mujoco.MjModel:
     """Two bodies beside the plane, with frames of their own; ``{n}``, ``{s}``: name and side."""
     bodies = "".join(
         f"""<body name="{n}" pos=".1 {0.3 * s} 1" quat="{quat}"><joint name="{n}" type="ball"/>
@@ -141,7 +141,7 @@ def swingers(sites: str, actuators: str) -> mujoco.MjModel:
     sides = (("left", 1), ("right", -1))
     root = "".join(f'<site name="root_{n}" pos=".4 {0.2 * s} .5"/>' for n, s in sides)
     both = "".join(actuators.format(n=n) for n, _ in sides)
-    return compiled(f"<worldbody>{root}{bodies}</worldbody><actuator>{both}</actuator>")
+    return compiled(f"<worldbody>{root}{bodies}</worldbody><actuator>{both}</actuator>{rest}")
 
 
 def turned(quat: str, points: tuple[float, ...]) -> str:
@@ -175,6 +175,27 @@ def test_transmissions_in_other_frames_are_mapped(name):
     assert robot.table("actuator", 1) == {"left": "-right", "right": "-left"}
     assert worst_step(model, robot) <= 1e-9
     model.actuator_gear[1] = gear
+    with pytest.raises(SymmetryError, match="left has no image: no actuator drives"):
+        derive(model, MIRROR)
+
+
+def test_the_zero_of_a_ball_is_the_frame_of_its_parent():
+    key = '<keyframe><key name="home" qpos="1 0 0 0 .5 .5 .5 .5"/></keyframe>'
+    model = swingers("", '<motor name="{n}" jointinparent="{n}"/>', key)
+    model.body_quat[model.body("right").id] = (
+        1,
+        0,
+        0,
+        0,
+    )  # it looks like the left one in the keyframe only
+    model.actuator_gear[:, :3] = (1, 2, 3), (-1, 2, -3)
+    robot = derive(model, MIRROR)
+    assert "home" in robot.pose
+    assert robot.table("actuator", 1) == {"left": "right", "right": "left"}
+    assert worst_step(model, robot) <= 1e-9
+    # angles from two zeros that are no images of each other are not mapped
+    model.actuator_biastype[:] = int(mujoco.mjtBias.mjBIAS_AFFINE)
+    model.actuator_biasprm[:, 1] = -1
     with pytest.raises(SymmetryError, match="left has no image: no actuator drives"):
         derive(model, MIRROR)
 

@@ -79,11 +79,17 @@ def test_joints_keep_their_order_unless_they_commute(name):
         assert worst_step(hips(left, right), MIRROR) <= 1e-9
 
 
+NEARLY = ("0 0 1", ".01 0 1")
+
+
 def test_hinges_on_one_line_go_to_each_other_in_order():
     wrist = hinge("yaw", "0 0 1") + Y + hinge("roll", "0 0 1")  # first and last are one line at zero
     table = derive(hips(wrist, wrist), MIRROR).table("joint", 1)
     assert table["yaw_left"] == "-yaw_right"
     assert table["roll_left"] == "-roll_right"
+    # nearer crosswise, by a hair: the order decides
+    wrists = (f"{hinge('yaw', one)}{Y}{hinge('roll', other)}" for one, other in (NEARLY, NEARLY[::-1]))
+    assert derive(hips(*wrists), MIRROR).table("joint", 1)["yaw_left"] == "-yaw_right"
 
 
 BASE = """<body name="base" pos="0 0 .5">{}<geom type="cylinder" size=".2 .05"/></body>"""
@@ -108,7 +114,8 @@ def test_a_little_out_of_order_is_told_to_the_audit():
 # --- slides that mix
 
 ARMS = "".join(
-    f"""<frame euler="0 0 {2 * np.pi * k / 3}"><body name="arm{k}" pos=".2 0 0"><joint name="arm{k}" axis="0 1 0"/>
+    f"""<frame euler="0 0 {2 * np.pi * k / 3}"><body name="arm{k}" pos=".2 0 0">
+      <joint name="arm{k}" axis="0 1 0"/>
       <geom type="capsule" fromto="0 0 0 .1 .05 -.2" size=".02"/></body></frame>"""
     for k in range(3)
 )
@@ -131,8 +138,9 @@ MOTORS = """<actuator><motor name="mx" joint="x" gear="3"/><motor name="my" join
   <position name="px" joint="x" kp="20"/><position name="py" joint="y" kp="20" timeconst=".1"/>
   <position name="yaw" joint="yaw" kp="20"/></actuator>"""
 MOTORS = MOTORS.replace('joint="x" kp="20"', 'joint="x" kp="20" timeconst=".1"')
-SENSORS = """<sensor><jointpos name="qx" joint="x"/><jointpos name="qy" joint="y"/><jointvel name="vy" joint="y"/>
-  <jointvel name="vx" joint="x"/><actuatorfrc name="fx" actuator="mx"/><actuatorfrc name="fy" actuator="my"/>
+SENSORS = """<sensor><jointpos name="qx" joint="x"/><jointpos name="qy" joint="y"/>
+  <jointvel name="vy" joint="y"/><jointvel name="vx" joint="x"/>
+  <actuatorfrc name="fx" actuator="mx"/><actuatorfrc name="fy" actuator="my"/>
   <jointactuatorfrc name="jy" joint="y"/><jointactuatorfrc name="jx" joint="x"/></sensor>"""
 
 
@@ -183,6 +191,24 @@ def test_a_mixing_base_that_does_not_start_at_zero_has_offsets():
     model = compiled(planar(ref=0.4), MOTORS)  # the coordinate is 0.4 where the base is on the axis
     robot = derive(model, C3)
     assert robot.offsets("rot-120")["y"] == pytest.approx(0.6)  # of its image x
+    assert worst_step(model, C3) <= 1e-9
+
+
+def test_a_base_that_leans_a_little_still_has_an_exact_representation():
+    leaning = (
+        planar()
+        .replace('axis="1.0 0.0 0"', 'axis="1 0 .002"')
+        .replace('axis="-0.0 1.0 0"', 'axis="0 1 -.001"')
+    )
+    robot = derive(compiled(leaning), C3)  # which checks that it composes
+    assert robot.joints(["x", "y"]).matrices[1, 0, 0] == pytest.approx(-0.5, abs=1e-5)
+    assert 1e-6 < worst_step(compiled(leaning), C3) < 1e-2
+
+
+def test_a_mixing_base_may_stand_aside():
+    model = compiled(planar(place=".3 -.2 .5"), MOTORS)
+    robot = derive(model, C3)
+    assert robot.axis == pytest.approx((0.3, -0.2))
     assert worst_step(model, C3) <= 1e-9
 
 

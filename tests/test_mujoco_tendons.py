@@ -12,7 +12,11 @@ MIRROR = PointGroup.reflection("y")
 
 
 def legs(
-    right: str = "", wrap: str = "cylinder", side: str = ".08 {y} .3", paths: tuple[str, str] | None = None
+    right: str = "",
+    wrap: str = "cylinder",
+    side: str = ".08 {y} .3",
+    paths: tuple[str, str] | None = None,
+    rest: str | None = None,
 ) -> mujoco.MjModel:
     """Two swinging legs, whose tendons run over a pulley beside them.
 
@@ -21,6 +25,7 @@ def legs(
         wrap: type of the geoms that the tendons wrap around.
         side: place of the left side site.
         paths: other paths of the tendons.
+        rest: actuators, a motor on each tendon by default, and constraints.
     """
     size = {"cylinder": 'size=".05 .03" euler="90 0 0"', "sphere": 'size=".05"'}[wrap]
     leg = """<site name="top_{n}" pos="0 {y} .6"/><site name="side_{n}" pos="{place}"/>
@@ -36,12 +41,11 @@ def legs(
     tendons = f'<spatial name="left">{one.format(n="left")}</spatial>'
     tendons += f'<spatial name="right">{other.format(n="right")}</spatial>'
     return mujoco.MjModel.from_xml_string(f"""<mujoco><option integrator="implicitfast" timestep=".002"/>
-      <worldbody>{bodies}</worldbody><tendon>{tendons}</tendon>
-      <actuator><motor name="left" tendon="left" gear="5"/>
-      <motor name="right" tendon="right" gear="5"/></actuator>
-      </mujoco>""")
+      <worldbody>{bodies}</worldbody><tendon>{tendons}</tendon>{rest or MOTORS}</mujoco>""")
 
 
+MOTORS = """<actuator><motor name="left" tendon="left" gear="5"/>
+  <motor name="right" tendon="right" gear="5"/></actuator>"""
 PATH = '<site site="top_{n}"/><geom geom="pulley_{n}" sidesite="side_{n}"/><site site="tip_{n}"/>'
 BACK = '<site site="tip_{n}"/><geom geom="pulley_{n}" sidesite="side_{n}"/><site site="top_{n}"/>'
 SHORT = '<site site="top_{n}"/><geom geom="pulley_{n}"/><site site="tip_{n}"/>'
@@ -89,6 +93,16 @@ def test_branches_of_pulleys_may_come_in_another_order():
     wrong = other.replace('"2"/><site site="side', '"3"/><site site="side')
     with pytest.raises(SymmetryError, match="left has no image"):
         derive(legs(paths=(one, wrong)), MIRROR)
+
+
+def test_one_motor_may_pull_two_tied_tendons():
+    tie = '<equality><tendon name="tie" tendon1="{}" tendon2="{}"/></equality>'
+    motor = '<actuator><motor name="pull" tendon="left"/></actuator>'
+    for order in (("left", "right"), ("right", "left")):
+        image = derive(legs(rest=motor + tie.format(*order)), MIRROR).actions[1].actuators[0]
+        assert (image.index, image.sign, image.through) == (0, 1.0, "tie")
+    with pytest.raises(SymmetryError, match="pull has no image"):
+        derive(legs(rest=motor), MIRROR)
 
 
 @pytest.mark.parametrize("what", ["radius", "place", "axis"])

@@ -4,7 +4,7 @@ import mujoco
 import pytest
 
 from torchrl_sym import PointGroup
-from torchrl_sym.mujoco import audit
+from torchrl_sym.mujoco import audit, derive
 
 MIRROR = PointGroup.reflection("y")
 PENDULUM = """<mujoco><option gravity="{gravity}"/><worldbody>
@@ -134,3 +134,36 @@ def test_friction_is_compared_with_what_the_joint_can_do():
     weight = 9.81 * 1 * 0.15
     assert residuals[:3] == pytest.approx([0.1 / 40, 0.1 / 2, 0.1 / weight])
     assert residuals[3] == pytest.approx(0.5e-3), "no motor makes a difference of friction vanish"
+
+
+WHEELS = """<mujoco><worldbody>
+  <body name="left" pos="0 .2 1"><joint name="left" axis="0 1 0"/><geom size=".1" pos=".1 0 0"/></body>
+  <body name="right" pos="0 -.2 1"><joint name="right" axis="0 -1 0"/><geom size=".1" pos=".1 0 0"/></body>
+  </worldbody><actuator>{left}{right}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("actuator", "image", "outcome"),
+    [
+        ('<damper joint="{0}" name="{0}" kv="2" ctrlrange="0 1"/>', "right", "exact"),
+        ('<motor joint="{0}" name="{0}" ctrlrange="-1 1"/>', "-right", "exact"),
+        ('<motor joint="{0}" name="{0}" ctrlrange="0 1"/>', "-right", "no"),
+    ],
+)
+def test_a_damper_keeps_the_sign_of_its_control(actuator, image, outcome):
+    text = WHEELS.format(left=actuator.format("left"), right=actuator.format("right"))
+    model = mujoco.MjModel.from_xml_string(text)
+    assert derive(model, MIRROR).table("joint", 1)["left"] == "-right"
+    assert derive(model, MIRROR).table("actuator", 1)["left"] == image
+    assert audit(model, MIRROR).outcome == outcome
+
+
+@pytest.mark.parametrize(("spin", "outcome"), [(-1, "exact"), (1, "no")])
+def test_rotors_of_a_drone_turn_against_each_other(spin, outcome):
+    rotor = '<motor name="{0}" site="{0}" gear="0 0 1 0 0 {1}"/>'
+    rotors = rotor.format("left", 0.02) + rotor.format("right", spin * 0.02)
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody>
+      <body name="drone" pos="0 0 1"><freejoint/><geom type="box" size=".2 .2 .05"/>
+        <site name="left" pos="0 .2 0"/><site name="right" pos="0 -.2 0"/></body>
+      </worldbody><actuator>{rotors}</actuator></mujoco>""")
+    assert audit(model, MIRROR).outcome == outcome

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import sys
 import time
 import traceback
 import warnings
@@ -53,8 +54,15 @@ def examine_all(jobs: Sequence[Job], workers: int, limit: float) -> list[Row]:
             process.join()
             del active[connection]
             bar.update()
+            _say(rows[key])
     bar.close()
     return [rows[key] for key, _, _ in jobs if rows[key] is not None]
+
+
+def _say(row: Row | None) -> None:
+    """What needs a person's eye is said at once: the whole run takes half an hour."""
+    for text in [] if row is None else [row.error] * bool(row.error) + row.against:
+        tqdm.write(f"{row.key}: {text}", file=sys.stderr)
 
 
 def _work(connection: Connection, key: str, path: Path, expected: Expectation | None) -> None:

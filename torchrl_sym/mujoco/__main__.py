@@ -91,6 +91,9 @@ def main(arguments: Arguments) -> int:
             sys.stdout.write(f"{text}\n")
     except _NoSymmetry:
         return 1
+    except BrokenPipeError:  # whoever read the output has seen enough
+        sys.stdout = None
+        return 0
     except (KeyError, OSError, TypeError, ValueError) as error:
         reason = error.args[0] if isinstance(error, KeyError) else error
         sys.stderr.write(f"error: {' '.join(str(reason).split())}\n")
@@ -111,6 +114,8 @@ def _answers(arguments: Arguments) -> Iterator[str]:
         yield f"{found}\n"
         group, report = found.group, found.audit
         if group.order == 1:
+            if arguments.out is not None:
+                yield _unwritten(arguments.out)
             raise _NoSymmetry
     else:
         group = named_group(arguments.group).turned(arguments.plane)
@@ -121,10 +126,14 @@ def _answers(arguments: Arguments) -> Iterator[str]:
     yield str(report)
     if report.outcome not in _SYMMETRIC:
         if arguments.out is not None:
-            yield f"\n{arguments.out} was not written: there is no symmetry to average over"
+            yield _unwritten(arguments.out)
         raise _NoSymmetry
     if arguments.out is not None:
         yield _write(arguments, spec, group, where)
+
+
+def _unwritten(path: Path) -> str:
+    return f"\n{path} was not written: there is no symmetry to average over"
 
 
 def _write(arguments: Arguments, spec: Any, group: PointGroup, where: dict[str, Any]) -> str:

@@ -12,6 +12,8 @@ from torchrl_sym.mujoco.model.types import mj, name_of
 _GAIN, _BIAS = mj.mjtGain, mj.mjtBias
 _PLAIN_GAINS = (int(_GAIN.mjGAIN_FIXED), int(_GAIN.mjGAIN_AFFINE))
 _PLAIN_BIASES = (int(_BIAS.mjBIAS_NONE), int(_BIAS.mjBIAS_AFFINE))
+_MUSCLES = int(_GAIN.mjGAIN_MUSCLE), int(_BIAS.mjBIAS_MUSCLE), int(mj.mjtDyn.mjDYN_MUSCLE)
+_LINEAR = [int(getattr(mj.mjtDyn, f"mjDYN_{n}")) for n in ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT")]
 
 
 def compare_actuators(c: Comparison) -> None:
@@ -35,16 +37,21 @@ def compare_actuators(c: Comparison) -> None:
         alike = np.flatnonzero(model.actuator_trntype == model.actuator_trntype[a])
         gears = np.linalg.norm(model.actuator_gear, axis=1, keepdims=True)
         c.values("gear", gears, a, b, name, alike)
-        c.fields("actuator gain", ["actuator_lengthrange"], a, b, name, alike)
+        kinds = (model.actuator_gaintype[a], model.actuator_biastype[a], model.actuator_dyntype[a])
+        if any(
+            kind == muscle for kind, muscle in zip(kinds, _MUSCLES, strict=True)
+        ):  # nothing else asks it
+            c.fields("actuator gain", ["actuator_lengthrange"], a, b, name, alike)
         c.fields("armature", ["actuator_armature"], a, b, name)
-        c.fields("damping", ["actuator_damping"], a, b, name)
-        for term, field, limited, shift in (
-            ("ctrlrange", "actuator_ctrlrange", "actuator_ctrllimited", image.offset),
-            ("forcerange", "actuator_forcerange", "actuator_forcelimited", 0.0),
-            ("actrange", "actuator_actrange", "actuator_actlimited", image.state_offset),
+        c.fields("damping", ["actuator_damping", "actuator_dampingpoly"], a, b, name)
+        control = image.control_sign
+        for term, field, limited, turn, shift in (
+            ("ctrlrange", "actuator_ctrlrange", "actuator_ctrllimited", control, image.offset),
+            ("forcerange", "actuator_forcerange", "actuator_forcelimited", sign, 0.0),
+            ("actrange", "actuator_actrange", "actuator_actlimited", control, image.state_offset),
         ):
             if not image.mixture:
-                c.range(term, field, limited, a, b, sign, shift, name)
+                c.range(term, field, limited, a, b, turn, shift, name)
             elif getattr(model, limited)[a]:
                 c.add(term, 1.0, f"{name} (a box, which the element turns)")
 
@@ -54,11 +61,20 @@ def _gains(c: Comparison, a: int, image: Image, name: str) -> None:
     model, b, sign, offset = c.model, image.index, image.sign, image.offset
     gain, bias = model.actuator_gainprm[a].copy(), model.actuator_biasprm[a].copy()
     kind = int(model.actuator_gaintype[a])
+    linear = kind == _GAIN.mjGAIN_FIXED and int(model.actuator_biastype[a]) in _PLAIN_BIASES
+    linear &= not np.any(getattr(model, "actuator_dampingpoly", np.zeros((model.nu, 1)))[a])
+    if image.mixture and not (linear and int(model.actuator_dyntype[a]) in _LINEAR):
+        c.add("actuator gain", 1.0, f"{name} (forces that are not linear, which the element turns)")
     if kind in _PLAIN_GAINS and int(model.actuator_biastype[a]) in _PLAIN_BIASES:
         if kind == _GAIN.mjGAIN_AFFINE:
-            gain[1:3] *= sign
-            gain[0] -= gain[1] * offset
-        bias[0] = sign * bias[0] - (gain[0] + bias[1]) * offset
+            gain[0] *= sign * image.control_sign
+            gain[1:3] *= image.control_sign
+            gain[0] -= gain[1] * (image.length_offset if image.keeps else offset)
+        constant = sign * bias[0]
+        if image.mixture:
+            others = c.action.actuators.items()
+            constant = sum(x.weights.get(b, 0.0) * model.actuator_biasprm[k, 0] for k, x in others)
+        bias[0] = constant - (gain[0] + bias[1]) * offset
     elif sign < 0 and kind == _GAIN.mjGAIN_MUSCLE:
         c.add("actuator gain", 1.0, f"{name} (a muscle only pulls)")
     elif sign < 0:

@@ -82,7 +82,7 @@ def _unmirrored(model: MjModel) -> Iterator[tuple[list[tuple[int, int]], int]]:
     """Sets of like pairs of geoms whose contacts are not mirrored: the first few, and how many."""
     filters, kinds = Filters(model), model.geom_type
     cornered = np.zeros(model.ngeom, dtype=int)
-    for g in np.flatnonzero(filters.may.any(axis=1)[filters.of] & (kinds == MESH)):
+    for g in np.flatnonzero(np.any(filters.may, axis=1, keepdims=True)[filters.of, 0] & (kinds == MESH)):
         cornered[g] = _has_many_cornered_face(model, int(g))
     keys = np.stack([filters.of, kinds, cornered], axis=1)
     alike, starts, labels = np.unique(keys, axis=0, return_index=True, return_inverse=True)

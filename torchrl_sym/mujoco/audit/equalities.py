@@ -14,6 +14,7 @@ import numpy as np
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.derive.images import Image
+from torchrl_sym.mujoco.derive.lengths import Ties, map_lengths
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.rotations import rotation
 from torchrl_sym.mujoco.model.types import HINGE, Array, MjData, MjModel, mj, name_of
@@ -35,6 +36,11 @@ def compare_equalities(c: Comparison) -> None:
             c.unchecked.append(f"equality constraint {label!r}, of an unsupported kind")
             continue
         residual, _, f = min((constraints.residual(e, f), f != e, f) for f in range(model.neq))
+        if residual >= 1 and constraints.follows(e):
+            c.add(
+                "equality constraints", DISCRETE, f"{label} (no single image, but it follows from others)"
+            )
+            continue
         name = c.name("equality", e, f) if residual < 1 else f"{label} (no image)"
         c.add("equality constraints", residual, name)
         if residual < 1:
@@ -51,6 +57,7 @@ class _Constraints:
 
     def __post_init__(self) -> None:
         model = self.c.model
+        self.ties = Ties.of(model)
         for e in range(model.neq):
             if int(model.eq_type[e]) in (_CONNECT, _WELD):
                 self.ends[e] = _ends(model, self.c.data, e)
@@ -77,7 +84,7 @@ class _Constraints:
         mine, theirs = (
             [int(x) for x in (model.eq_obj1id[k], model.eq_obj2id[k])] for k in (e, f)
         )  # -1: none
-        if any(x >= 0 and x not in images for x in mine) or (
+        if any(x >= 0 and (x not in images or images[x].mixture) for x in mine) or (
             is_joint and any(x >= 0 and x not in signs for x in mine)
         ):
             return 1.0
@@ -86,13 +93,27 @@ class _Constraints:
         for ends, powers in _ways_to_write(theirs, model.eq_data[f, :5]):
             if [image.index for image in moved] == ends:
                 image = moved[0].sign * moved[1].sign ** np.arange(5) * model.eq_data[e, :5]
-                gap = np.abs(image - powers).max()
+                gap = np.abs(image - powers)[: 1 if mine[1] < 0 else None].max()  # of one end, a constant
                 for i, j in zip(mine, ends, strict=True) if is_joint else ():
                     if i >= 0:  # the polynomial is about qpos0
                         q, r = model.qpos0[model.jnt_qposadr[[i, j]]]
                         gap = max(gap, abs(signs[i] * q + self.c.map.offsets[i] - r))
                 worst = min(worst, float(gap))
         return worst
+
+    def follows(self, e: int) -> bool:
+        """Whether the image of a linear constraint says what others together say, as along a chain."""
+        row = np.flatnonzero(np.array(self.ties.equalities, dtype=int) == e)
+        if not len(row):
+            return False
+        matrix, offset = map_lengths(self.c.model, self.c.map, self.c.action.tendons)
+        image = matrix @ self.ties.rows[row[0]]
+        k = self.ties.combine(image)
+        if k is None:
+            return False
+        # lengths l . x become l . x' with x' = Q x + o
+        value = self.ties.values[row[0]] + image @ offset
+        return bool(abs(k @ self.ties.values - value) < 1e-6 * max(1.0, np.abs(value)))
 
     def _bodies(self, e: int, f: int) -> float:
         """Points that a connect or weld joins, and the rotation that a weld asks for."""
@@ -106,9 +127,16 @@ class _Constraints:
                 if not weld and idle is not None:  # a constraint along the axis of all hinges does nothing
                     gaps = gaps - np.outer(gaps @ idle, idle)
                     apart = max(np.linalg.norm(gaps, axis=1).max(), min(apart, DISCRETE * c.matcher.extent))
-                beside = apart if weld else min(apart, self._beside(points[order] @ turn.T, f))
+                moved, aligned = points[order] @ turn.T, turned if order == [0, 1] else turned.T
+                if weld:  # it asks for one pose, whatever point of the bodies it is put at
+                    one, other = moved, points_f
+                    beside = float(
+                        np.linalg.norm(one[0] - turned_f @ one[1] - other[0] + turned_f @ other[1])
+                    )
+                else:
+                    beside = self._beside(moved, f)
+                beside = min(apart, beside)
                 gap = max(beside, min(apart, DISCRETE * c.matcher.extent)) / c.matcher.extent
-                aligned = turned if order == [0, 1] else turned.T
                 gap = max(gap, np.abs(turn @ aligned @ turn.T - turned_f).max())
                 gap = max(gap, abs(c.model.eq_data[e, 10] - c.model.eq_data[f, 10]) * weld)
                 worst = min(worst, float(gap))

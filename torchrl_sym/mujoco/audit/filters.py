@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchrl_sym.mujoco.audit.comparison import Comparison, column_scale
 from torchrl_sym.mujoco.audit.encounters import Encounters
+from torchrl_sym.mujoco.audit.report import Kind
 from torchrl_sym.mujoco.audit.shapes import DISCRETE
 from torchrl_sym.mujoco.model.filters import Filters, feels_fluid, geom_label
 from torchrl_sym.mujoco.model.releases import weld_ids
@@ -40,7 +41,8 @@ def compare_contacts(c: Comparison, images: dict[int, int]) -> None:
 def _compare_parameters(c: Comparison, mine: NDArray[np.intp], theirs: NDArray[np.intp]) -> None:
     """Friction, softness and margins of geoms, judged with their shapes."""
     world = weld_ids(c.model)[c.model.geom_bodyid[mine]] == 0
-    for kind, some in (("collision", ~world), ("scenery", world)):
+    judged: tuple[tuple[Kind, NDArray[np.bool_]], ...] = (("collision", ~world), ("scenery", world))
+    for kind, some in judged:
         for term, fields in _PARAMETERS.items():
             gaps = [_gap(c, field, mine[some], theirs[some]) for field in fields if hasattr(c.model, field)]
             term = "scenery contacts" if kind == "scenery" else term
@@ -67,7 +69,7 @@ def _gap(c: Comparison, field: str, a: NDArray[np.intp], b: NDArray[np.intp]) ->
 
 
 def _add_worst(
-    c: Comparison, term: str, gaps: Array, a: NDArray[np.intp], b: NDArray[np.intp], kind: str
+    c: Comparison, term: str, gaps: Array, a: NDArray[np.intp], b: NDArray[np.intp], kind: Kind
 ) -> None:
     if not len(a):
         return

@@ -55,6 +55,8 @@ def _compare_mixing(c: Comparison, i: int, name: str) -> None:
     """A slide whose coordinate enters those of several: what its axis becomes; no box may limit it."""
     axes = sum(weight * c.data.xaxis[k] for k, weight in c.map.mixed[i].items())
     c.add("joint axis", float(np.linalg.norm(c.matcher.matrix @ c.data.xaxis[i] - axes)), name)
+    if np.any(getattr(c.model, "jnt_stiffnesspoly", np.zeros((c.model.njnt, 1)))[i]):
+        c.add("stiffness", 1.0, f"{name} (springs that are not linear, which the element turns)")
     for term, limited in (("joint range", "jnt_limited"), ("joint force range", "jnt_actfrclimited")):
         if getattr(c.model, limited)[i]:
             c.add(term, 1.0, f"{name} (a box, which the element turns)")
@@ -71,21 +73,25 @@ def compare_dofs(c: Comparison) -> None:
     model = c.model
     tied = _tied_dofs(c)
     for term in ("damping", "armature", "frictionloss"):
-        _compare_losses(c, term, np.array(getattr(model, f"dof_{term}")), tied)
+        _compare_losses(c, term, np.array(getattr(model, f"dof_{term}")), tied, term != "frictionloss")
     for column in getattr(model, "dof_dampingpoly", np.zeros((model.nv, 0))).T:
-        _compare_losses(c, "damping", np.array(column), tied)
+        _compare_losses(c, "damping", np.array(column), tied, linear=False)
     for i, j in c.map.joints.items():
         a, b = int(model.jnt_dofadr[i]), int(model.jnt_dofadr[j])
         if model.dof_frictionloss[a] > 0:
             c.fields("joint solref/solimp", ["dof_solref", "dof_solimp"], a, b, c.name("joint", i, j))
 
 
-def _compare_losses(c: Comparison, term: str, values: Array, tied: list[tuple[int, int]]) -> None:
+def _compare_losses(
+    c: Comparison, term: str, values: Array, tied: list[tuple[int, int]], linear: bool = True
+) -> None:
     """One number per dof. Where a constraint makes two dofs one, only their sum acts."""
     if not values.any():
         return
     scale = c.efforts.scale(term, values)
     gap = _gap(c, values, scale)
+    if not linear:  # friction of two slides is bounded by a box, which must not be turned
+        gap = gap + np.abs(values) / scale * _turned(c.map.qvel)
     if gap.max(initial=0.0) > 0.0 and tied:
         shared = values.copy()
         for a, b in tied:
@@ -96,6 +102,12 @@ def _compare_losses(c: Comparison, term: str, values: Array, tied: list[tuple[in
         start = int(c.model.jnt_dofadr[j])
         stop = start + dofs_of(c.model, j)
         c.add(term, float(gap[start:stop].max()), c.name("joint", i, j))
+
+
+def _turned(matrix: Array) -> Array:
+    """How far each row of an orthogonal matrix is from having a single entry, 0 to 1."""
+    shares = 1 - np.abs(matrix).max(axis=1, initial=0.0)
+    return np.where(shares > 1e-12, shares, 0.0)
 
 
 def _gap(c: Comparison, values: Array, scale: Array) -> Array:

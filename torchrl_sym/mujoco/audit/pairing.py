@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS
 from torchrl_sym.mujoco.model.types import Array
@@ -55,7 +55,7 @@ def _offer(mine: Array, theirs: Array, my_ids: Numbers, their_ids: Numbers) -> l
     """Pairs in the order of their costs, among the nearest of each."""
     count = min(_NEAREST, len(theirs))
     # the mean of d h(d) is a point of the shape: it moves by at most what the support function does
-    tree = cKDTree(theirs @ DIRECTIONS)
+    tree = KDTree(theirs @ DIRECTIONS)
     near = tree.query(mine @ DIRECTIONS, k=count)[1].reshape(len(mine), count)
     cost = np.stack([np.abs(mine - theirs[near[:, k]]).max(axis=1) for k in range(count)], axis=1)
     cost += _STAYS * (my_ids[:, None] != their_ids[near])

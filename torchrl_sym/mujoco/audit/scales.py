@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sym.mujoco.derive.lengths import is_fixed, joint_length, tendon_length
 from torchrl_sym.mujoco.model.types import FREE, HINGE, SLIDE, Array, MjData, MjModel, mj
 
 SPEED = 10.0  # of a turning joint, rad/s; of a sliding one, tree sizes per second
@@ -25,24 +26,42 @@ _ON_JOINT = (int(_TRANSMISSION.mjTRN_JOINT), int(_TRANSMISSION.mjTRN_JOINTINPARE
 
 @dataclass
 class Efforts:
-    """Torque or force of every degree of freedom, which of them turn, and the size of what moves."""
+    """Torque or force of every degree of freedom, which turn, the size of what moves, inertias at qpos0."""
 
     torque: Array
     turning: NDArray[np.bool_]
     size: float
+    inertia: Array
 
     def scale(self, term: str, values: Array) -> Array:
         """What a residual of 1 is, for each dof; ``values`` are the model's, ``(nv,)``."""
-        lengths = np.where(self.turning, 1.0, self.size)
-        natural = {
-            "frictionloss": self.torque,
-            "damping": self.torque / (SPEED * lengths),
-            "stiffness": self.torque / lengths,
-        }.get(term, np.zeros_like(self.torque))
+        natural = self._natural(term)
         masks = self.turning, ~self.turning
         largest = np.where(self.turning, *(np.abs(values[mask]).max(initial=0.0) for mask in masks))
         largest = np.where(largest > 0, largest, 1.0)
         return np.where(natural > 0, np.minimum(natural, MOST * largest), largest)
+
+    def tendon_scale(self, term: str, values: Array, lengths: Array) -> Array:
+        """What a residual of 1 is, for each tendon: what is as much for a joint that it moves.
+
+        Args:
+            term: which loss.
+            values: the model's, ``(ntendon,)``.
+            lengths: coefficients of velocities, ``(ntendon, nv)``; zero for spatial tendons.
+        """
+        levers = np.abs(lengths) ** (1 if term == "frictionloss" else 2)
+        natural = np.where(levers > 0, self._natural(term) / np.where(levers > 0, levers, 1.0), np.inf)
+        least, largest = natural.min(axis=1, initial=np.inf), float(np.abs(values).max(initial=0.0)) or 1.0
+        return np.where(np.isfinite(least) & (least > 0), np.minimum(least, MOST * largest), largest)
+
+    def _natural(self, term: str) -> Array:
+        lengths = np.where(self.turning, 1.0, self.size)
+        return {
+            "frictionloss": self.torque,
+            "damping": self.torque / (SPEED * lengths),
+            "stiffness": self.torque / lengths,
+            "armature": self.inertia,
+        }.get(term, np.zeros_like(self.torque))
 
 
 def efforts_of(model: MjModel, data: MjData, size: float) -> Efforts:
@@ -52,17 +71,19 @@ def efforts_of(model: MjModel, data: MjData, size: float) -> Efforts:
     linear = (kinds == SLIDE) | ((kinds == FREE) & (offset < 3))
     limits = _motor_limits(model)
     torque = np.where(limits > 0, limits, _weights(model, data, linear))
-    return Efforts(torque, ~linear, max(size, 1e-6))
+    return Efforts(torque, ~linear, max(size, 1e-6), np.array(model.dof_M0))
 
 
 def _motor_limits(model: MjModel) -> Array:
     """Largest torque of each joint's motors; 0 where nothing limits it."""
     limits = np.zeros(model.nv)
     for a in range(model.nu):
-        if int(model.actuator_trntype[a]) not in _ON_JOINT:
-            continue
-        joint = int(model.actuator_trnid[a, 0])
-        if int(model.jnt_type[joint]) not in (HINGE, SLIDE):
+        target, kind = int(model.actuator_trnid[a, 0]), int(model.actuator_trntype[a])
+        if kind in _ON_JOINT and int(model.jnt_type[target]) in (HINGE, SLIDE):
+            length = joint_length(model, target)
+        elif kind == int(_TRANSMISSION.mjTRN_TENDON) and is_fixed(model, target):
+            length = tendon_length(model, target)
+        else:
             continue
         gear = abs(float(model.actuator_gear[a, 0]))
         force = 0.0
@@ -70,7 +91,7 @@ def _motor_limits(model: MjModel) -> Array:
             force = float(np.abs(model.actuator_forcerange[a]).max())
         elif model.actuator_ctrllimited[a]:
             force = float(np.abs(model.actuator_ctrlrange[a]).max() * abs(model.actuator_gainprm[a, 0]))
-        limits[model.jnt_dofadr[joint]] += force * gear
+        limits += force * gear * np.abs(length[: model.nv])
     for j in range(model.njnt):
         if model.jnt_actfrclimited[j]:
             start, count = int(model.jnt_dofadr[j]), {FREE: 6}.get(int(model.jnt_type[j]), 1)

@@ -11,13 +11,15 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.audit.pairing import pair
+from torchrl_sym.mujoco.audit.report import Kind
 from torchrl_sym.mujoco.model.filters import active_geoms, feels_fluid, geom_label, lonely_geoms
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.shapes import DIRECTIONS, PLANE, SOLID, geom_supports
@@ -29,7 +31,11 @@ DISCRETE = 1e-2
 # By how much of its bounding radius a geom may reach beyond others that cover it: a foot that is missing
 # reaches farther. Pieces of a mesh are cut by chance: they may by more, if it is little of the robot.
 _STICKS_OUT, _PIECE, _A_LITTLE = 0.1, 0.5, 0.04
-_TERMS = {"collision": "collision geometry", "scenery": "scenery geometry", "dynamics": "fluid geometry"}
+_TERMS: dict[Kind, str] = {
+    "collision": "collision geometry",
+    "scenery": "scenery geometry",
+    "dynamics": "fluid geometry",
+}
 
 Numbers = NDArray[np.intp]
 
@@ -139,7 +145,7 @@ def _look_among(c: Comparison, s: Shapes, mine: dict[int, Numbers], idle: dict[i
         if not len(rest):
             continue
         centers = c.data.geom_xpos[s.geoms[rest]] @ c.matcher.matrix.T
-        apart = cKDTree(centers).query(c.image.geom_xpos[others])[0]
+        apart = KDTree(centers).query(c.image.geom_xpos[others])[0]
         others = others[apart <= DISCRETE * c.matcher.extent]  # meshes for the eye are large
         there = _features(c.model, c.image, others, np.eye(3), c.matcher.extent)
         one, other = pair(s.mine[rest], there, s.geoms[rest], others)
@@ -172,7 +178,7 @@ def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict
             s.images[i] = s.geoms[nearest]  # whose contact parameters it must have
         body = name_of(c.model, "body", int(c.model.geom_bodyid[s.geoms[nearest]]))
         name = f"{geom_label(c.model, geom)} (no single image, but geoms of {body!r} cover it)"
-        kind = str(s.kinds[i])
+        kind = cast(Kind, str(s.kinds[i]))
         c.add(f"{kind} pieces", DISCRETE, name, kind=kind)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_sym.mujoco.audit.comparison import Comparison
 from torchrl_sym.mujoco.derive.sites import map_sites
@@ -98,7 +99,7 @@ def _placeless(model: MjModel) -> set[int]:
     return _of_sensors(model, np.isin(model.sensor_type, _ANYWHERE)) | _numbers(sides)
 
 
-def _of_sensors(model: MjModel, some: Array) -> set[int]:
+def _of_sensors(model: MjModel, some: NDArray[np.bool_]) -> set[int]:
     return _numbers(
         model.sensor_objid[some & (model.sensor_objtype == _SITE)],
         model.sensor_refid[some & (model.sensor_reftype == _SITE)],

@@ -42,7 +42,10 @@ def map_actuators(
     cost = np.full((len(known), len(known)), _NONE)
     for (a, b), fit in fits.items():
         cost[known.index(a), known.index(b)] = (
-            _gain_distance(model, a, b) + 10 * fit.misfit + 1e-6 * (a != b)
+            _gain_distance(model, a, b)
+            + _one_sided(drives, a, b, fit.sign)
+            + 10 * fit.misfit
+            + 1e-6 * (a != b)
         )
     images: dict[int, Image] = {}
     for row, column in assign(cost):
@@ -78,10 +81,33 @@ def _gain_distance(model: MjModel, a: int, b: int) -> float:
     return distance
 
 
+def _one_sided(drives: Transmissions, a: int, b: int, sign: float) -> float:
+    """How little the image of what only pulls, or pulls more than it pushes, does so: of antagonists."""
+    model = drives.model
+    if sign < 0 and int(model.actuator_gaintype[a]) == int(mj.mjtGain.mjGAIN_MUSCLE):
+        return 1.0
+    if drives.is_servo(a) or not (model.actuator_ctrllimited[a] and model.actuator_ctrllimited[b]):
+        return 0.0
+    one, other = (
+        np.sort((1.0 if _is_damper(model, a) else sign) * model.actuator_ctrlrange[a]),
+        model.actuator_ctrlrange[b],
+    )
+    return min(1.0, float(np.abs(one - other).max()) / max(float(np.ptp(other)), 1e-12))
+
+
+def _is_damper(model: MjModel, a: int) -> bool:
+    """Whether the control scales a force that changes its sign with the length, or its velocity."""
+    constant, *slopes = model.actuator_gainprm[a, :3]
+    return bool(
+        int(model.actuator_gaintype[a]) == int(mj.mjtGain.mjGAIN_AFFINE) and constant == 0 and any(slopes)
+    )
+
+
 def _add_offset(drives: Transmissions, image: Image, a: int, shift: float) -> None:
     """What is added to the length, and to control and state of a servo, which are lengths."""
     image.length_offset = shift
-    if drives.is_servo(a):
+    image.keeps = _is_damper(drives.model, a)
+    if drives.is_servo(a) and not image.keeps:
         dynamics = int(drives.model.actuator_dyntype[a])
         image.offset = 0.0 if dynamics == _INTEGRATOR else shift
         image.state_offset = shift if dynamics in (*_FILTERS, _INTEGRATOR) else 0.0

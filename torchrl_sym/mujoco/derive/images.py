@@ -30,6 +30,8 @@ class Image:
             in each; empty if there is one.
         misfit: how far the image is from what it should be, relative; 0 in an exact model.
         through: the equality constraints that it takes for this to be the image.
+        keeps: whether an actuator's control keeps its sign, whatever that of its length: that of a damper,
+            whose force -k u v changes with the velocity.
     """
 
     index: int
@@ -40,16 +42,22 @@ class Image:
     mixture: dict[int, float] = field(default_factory=dict)
     misfit: float = 0.0
     through: str = ""
+    keeps: bool = False
+
+    @property
+    def control_sign(self) -> float:
+        """Sign of the image's control and state, which for dampers is not that of its length."""
+        return 1.0 if self.keeps else self.sign
 
     @property
     def weights(self) -> dict[int, float]:
         """The weight in each image."""
-        return self.mixture or {self.index: self.sign}
+        return self.mixture or {self.index: self.control_sign}
 
     def text(self, name: Callable[[int], str]) -> str:
         """The image in words: a name with its sign, or a sum."""
         if not self.mixture:
-            return "-" * (self.sign < 0) + name(self.index)
+            return "-" * (self.control_sign < 0) + name(self.index)
         terms = [f"{'-' if w < 0 else '+'} {abs(w):.4g} {name(i)}" for i, w in sorted(self.mixture.items())]
         whole = " ".join(terms)
         return (

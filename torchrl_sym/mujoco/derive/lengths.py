@@ -99,7 +99,11 @@ class Ties:
         if not len(self.rows):
             return None
         k = np.linalg.lstsq(self.rows.T, gap, rcond=None)[0]
-        return k if np.abs(self.rows.T @ k - gap).max() < 1e-6 * max(1.0, np.abs(gap).max()) else None
+        return (
+            np.asarray(k, dtype=np.float64)
+            if np.abs(self.rows.T @ k - gap).max() < 1e-6 * max(1.0, np.abs(gap).max())
+            else None
+        )
 
     def project(self, vector: Array) -> Array:
         """The part of a length that the constraints leave free."""

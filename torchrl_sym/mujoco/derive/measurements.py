@@ -81,8 +81,8 @@ class Measurements:
     def _through(self, kind: str, index: int) -> str:
         """Equality constraints that the image of an actuator on a joint or tendon takes."""
         where = "joint" if kind == "JOINTACTFRC" else "tendon"
-        images = self.coordinates.joints if where == "joint" else self.action.tendons
-        image = images[index] if where == "joint" else images[index].index
+        joints, tendons = self.coordinates.joints, self.action.tendons
+        image = joints[index] if where == "joint" else tendons[index].index
         for a, found in self.action.actuators.items():
             driven = {x for b in (a, found.index) for x in self._driven(where, b)}
             if found.through and driven & {index, image}:

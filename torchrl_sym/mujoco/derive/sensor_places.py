@@ -5,6 +5,8 @@ Distances are relative to the size of the tree of moving links that an object is
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 
 from torchrl_sym.mujoco.derive.matching import Matcher
@@ -24,7 +26,6 @@ class Places:
     def __init__(self, matcher: Matcher) -> None:
         self.matcher, self.model, self.turn = matcher, matcher.model, matcher.matrix
         self.data, self.image = matcher.data, matcher.image
-        self._active: list[int] | None = None
 
     def link(self, kind: str, index: int) -> int:
         """The link that an object is on."""
@@ -66,10 +67,12 @@ class Places:
         same = self.model.geom_type[a] == self.model.geom_type[b]
         return self.gap("GEOM", a, b) if same else MISFIT
 
+    @functools.cached_property
+    def _active(self) -> list[int]:
+        return active_geoms(self.model).tolist()
+
     def geoms(self, body: int, subtree: bool = False) -> list[int]:
         """Geoms of a body, or of its subtree, that may collide."""
-        if self._active is None:
-            self._active = active_geoms(self.model).tolist()
         owners, parents = self.model.geom_bodyid, self.model.body_parentid
 
         def inside(owner: int) -> bool:

@@ -247,7 +247,8 @@ class ModelSymmetry:
 
         Example:
             >>> import mujoco
-            >>> from torchrl_sym.mujoco import derive
+            >>> import torch
+            >>> from torchrl_sym.mujoco.derive.derive import derive
             >>> model = mujoco.MjModel.from_xml_string('''<mujoco><worldbody>
             ...   <body><joint type="slide" axis="0 1 0"/><geom size=".1"/></body>
             ... </worldbody></mujoco>''')

@@ -96,4 +96,6 @@ def _mixed(matcher: Matcher, map_: CoordinateMap, lengths: list[Array], t: int) 
             f"{name} has no image: no tendon couples the images of what it couples; add the missing "
             "tendon, or use a smaller group"
         )
-    return Image(max(weights, key=lambda u: abs(weights[u])), mixture=weights)
+    sizes = [float(np.linalg.norm(parts[u])) for u in {*weights, t}]
+    largest = max(weights, key=lambda u: abs(weights[u]))
+    return Image(largest, mixture=weights, misfit=max(sizes) / min(sizes) - 1)

@@ -170,6 +170,12 @@ class Transmissions:
             frame = site_frame(self.matcher, sites[1], theirs[1])
         wrench = np.concatenate([frame @ gear[:3], self.matcher.det * frame @ gear[3:]])
         fit = _parallel(wrench, other)
+        for part in (slice(0, 3), slice(3, 6)):  # a rotor's torque is small, and says which way it turns
+            if fit and gear[part].any() and other[part].any():
+                one = _parallel(wrench[part], other[part])
+                if one is None or one.sign != fit.sign:
+                    return None
+                fit = Fit(fit.sign, max(fit.misfit, one.misfit))
         if sites[1] >= 0 and gear[3:].any() and self.is_servo(a):
             fit = self._turned(fit, frame, own)
         return None if fit is None else Fit(fit.sign, max([fit.misfit, *gaps]))

@@ -16,6 +16,7 @@ from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import MjModel, mj, name_of
 
 _DISABLE = mj.mjtDisableBit
+_NO_CONTACT = int(_DISABLE.mjDSBL_CONTACT) | int(_DISABLE.mjDSBL_CONSTRAINT)
 
 
 class Filters:
@@ -37,7 +38,7 @@ class Filters:
         self.of: NDArray[np.intp] = of.reshape(-1)  # some versions of numpy add a dimension
         self.body, self.bits = unique[:, 0], unique[:, 1:]
         contype, conaffinity = self.bits.T
-        off = model.opt.disableflags & int(_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT)
+        off = model.opt.disableflags & _NO_CONTACT
         link = weld_ids(model)[self.body]
         self.moves: NDArray[np.bool_] = link != 0
         self.alike: NDArray[np.bool_] = (contype[:, None] & conaffinity) != 0
@@ -68,7 +69,7 @@ class Filters:
 def active_geoms(model: MjModel) -> NDArray[np.intp]:
     """Numbers of the geoms that matter for motion: they may touch another part or feel a fluid."""
     filters = Filters(model)
-    active = filters.alike.any(axis=1)[filters.of]
+    active = np.any(filters.alike, axis=1, keepdims=True)[filters.of, 0]
     active[filters.members()] = True
     return np.flatnonzero(active | feels_fluid(model))
 
@@ -87,14 +88,14 @@ def lonely_geoms(model: MjModel) -> NDArray[np.intp]:
         [0]
         []
     """
-    if model.opt.disableflags & int(_DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_CONSTRAINT):
+    if model.opt.disableflags & _NO_CONTACT:
         return np.array([], dtype=np.intp)
     filters = Filters(model)
     named = filters.members()
     if filters.alike[~filters.moves].any() or (~filters.moves[filters.of[named]]).any():
         return np.array([], dtype=np.intp)
     bits = (model.geom_contype | model.geom_conaffinity) != 0
-    lonely = bits & filters.moves[filters.of] & ~filters.may.any(axis=1)[filters.of]
+    lonely = bits & filters.moves[filters.of] & ~np.any(filters.may, axis=1, keepdims=True)[filters.of, 0]
     lonely[named] = False
     return np.flatnonzero(lonely)
 

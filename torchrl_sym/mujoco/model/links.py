@@ -16,6 +16,8 @@ from torchrl_sym import checks
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import FREE, Array, MjData, MjModel, name_of
 
+_NO_EXTENT = 1e-6  # metres; the size of what has none
+
 
 @dataclass
 class Link:
@@ -81,11 +83,13 @@ def sizes_of(model: MjModel, data: MjData, links: dict[int, Link]) -> dict[int, 
     np.minimum.at(bottom, owner, low)
     np.maximum.at(top, owner, high)
     trees = sorted(set(root.tolist()) - {0})
-    sizes = {b: max(float((top[b] - bottom[b]).max()), 1e-6) for b in trees}
+    sizes = {b: max(float((top[b] - bottom[b]).max()), _NO_EXTENT) for b in trees}
     fixed = [b for b in trees if not is_loose(model, b)]
     if fixed:
         together = float((top[fixed].max(axis=0) - bottom[fixed].min(axis=0)).max())
-        sizes |= dict.fromkeys(fixed, min(together, 2 * max(sizes[b] for b in fixed)))
+        together = min(together, 2 * max(sizes[b] for b in fixed))
+        # parked dummies have no extent of their own
+        sizes |= dict.fromkeys(fixed, together if together > _NO_EXTENT else max(sizes.values()))
     return sizes
 
 

@@ -52,14 +52,23 @@ class SymmetriesReport:
     @property
     def verdict(self) -> str:
         """One line: the group, and how exact it is."""
-        unclear = [c.name for c in self.candidates if c.report.outcome in ("cannot tell", "nothing")]
+        if self._still:
+            return self.candidates[0].report.verdict
+        unclear = [c.name for c in self.candidates if c.report.outcome == "cannot tell"]
         if self.group.order == 1:
             return f"cannot tell ({', '.join(unclear)})" if unclear else "no symmetry"
         elements = ", ".join(self.group.names[1:])
         return f"{elements}: {self.audit.verdict}"
 
+    @property
+    def _still(self) -> bool:
+        """Whether nothing can move, so that no element says more than another."""
+        return bool(self.candidates) and all(c.report.outcome == "nothing" for c in self.candidates)
+
     def __str__(self) -> str:
         lines = [self.verdict]
+        if self._still:
+            return lines[0]
         if self.group.order > 1:
             x, y = (round(value, 6) + 0.0 for value in self.axis)
             where = "the origin" if x == y == 0.0 else f"({x:g}, {y:g})"
@@ -70,5 +79,14 @@ class SymmetriesReport:
         lines += [""]
         for candidate in self.candidates:
             note = "" if candidate.moves or not candidate.found else " (moves nothing)"
-            lines.append(f"{candidate.name:<{width}s}  {candidate.report.verdict}{note}")
+            lines.append(f"{candidate.name:<{width}s}  {_short(candidate.report)}{note}")
         return "\n".join(lines)
+
+
+def _short(report: AuditReport) -> str:
+    """A verdict without the poses that were tried, which the audit of the element lists."""
+    for words in (" at the best of ", " at qpos0;", "; if another pose"):
+        head, found, _ = report.verdict.partition(words)
+        if found and report.outcome == "no":
+            return f"{head})"
+    return report.verdict

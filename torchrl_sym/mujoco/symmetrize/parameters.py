@@ -74,13 +74,16 @@ def average_actuators(averager: Averager) -> None:
 
     def control(g: int, a: int) -> tuple[float, float]:
         image = averager.actions[g].actuators[a]
-        return image.sign, lengths(g, a) * (image.offset != 0)
+        return image.control_sign, lengths(g, a) * (image.offset != 0)
 
-    def linear(g: int, a: int) -> tuple[float, float]:
+    def state(g: int, a: int) -> tuple[float, float]:
+        return averager.actions[g].actuators[a].control_sign, 0.0
+
+    def force(g: int, a: int) -> tuple[float, float]:
         return averager.actions[g].actuators[a].sign, 0.0
 
     def bias(g: int, a: int) -> Array:
-        (sign, offset), b, out = control(g, a), maps[g][a], biases[a].copy()
+        (_, offset), (sign, _), b, out = control(g, a), force(g, a), maps[g][a], biases[a].copy()
         if model.actuator_biastype[a] == int(mj.mjtBias.mjBIAS_AFFINE):
             out[0] = sign * out[0] - gains[b][0] * offset - slopes[b][1] * lengths(g, a)
         return out
@@ -91,7 +94,7 @@ def average_actuators(averager: Averager) -> None:
     average_unsigned(
         averager, maps, "actuator", {n: getattr(model, f"actuator_{n}") for n in ("gainprm", "dynprm")}
     )
-    for name, move in (("ctrl", control), ("force", linear), ("act", linear)):
+    for name, move in (("ctrl", control), ("force", force), ("act", state)):
         values, on = (getattr(model, f"actuator_{name}{what}") for what in ("range", "limited"))
         _signed(averager, maps, "actuator", f"{name}range", values, on, move)
 
