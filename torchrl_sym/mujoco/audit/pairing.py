@@ -18,11 +18,18 @@ _FEW = 64 * 64  # entries of a table of costs that takes a millisecond
 _NEAREST = 4  # candidates offered at a time
 _STAYS = 1e-9  # what is in one place is told apart by staying what it is, and by its order
 _ORDER = 1e-13
+_UNLIKE = 1e-8  # what touches otherwise, in the same place
 
 Numbers = NDArray[np.intp]
 
 
-def pair(mine: Array, theirs: Array, my_ids: Numbers, their_ids: Numbers) -> tuple[Numbers, Numbers]:
+def pair(
+    mine: Array,
+    theirs: Array,
+    my_ids: Numbers,
+    their_ids: Numbers,
+    labels: tuple[Numbers, Numbers] | None = None,
+) -> tuple[Numbers, Numbers]:
     """Rows of two sets of support functions that belong together.
 
     Args:
@@ -30,6 +37,7 @@ def pair(mine: Array, theirs: Array, my_ids: Numbers, their_ids: Numbers) -> tup
         theirs: those they are to be paired with, ``(m, d)``.
         my_ids: what they are; of equal costs, the pair of equal numbers is taken.
         their_ids: likewise for the others.
+        labels: of both; of what lies in one place, like labels are paired.
 
     Returns:
         Rows of ``mine`` and of ``theirs``, ``min(n, m)`` each.
@@ -45,6 +53,8 @@ def pair(mine: Array, theirs: Array, my_ids: Numbers, their_ids: Numbers) -> tup
         cost = np.abs(mine[rows][:, None] - theirs[columns]).max(axis=-1)
         cost += _STAYS * (my_ids[rows][:, None] != their_ids[columns])
         cost += _ORDER * np.abs(rows[:, None] - columns)
+        if labels is not None:
+            cost += _UNLIKE * (labels[0][rows][:, None] != labels[1][columns])
         best = linear_sum_assignment(cost)
         pairs += list(zip(rows[best[0]].tolist(), columns[best[1]].tolist(), strict=True))
     out = np.array(sorted(pairs), dtype=np.intp).reshape(-1, 2)

@@ -37,6 +37,8 @@ _TERMS: dict[Kind, str] = {
     "dynamics": "fluid geometry",
 }
 
+_CONTACT = ("contype", "conaffinity", "condim", "priority", "friction", "solref", "solimp", "margin")
+
 Numbers = NDArray[np.intp]
 
 
@@ -51,6 +53,7 @@ class Shapes:
         theirs: support functions where images are looked for, ``(n, d)``.
         images: numbers of the geoms that they go to, -1 for none.
         gaps: largest distance of each image from the geom that it goes to, infinite for none.
+        touches: numbers of how they touch; equal for equal contact parameters.
     """
 
     geoms: Numbers
@@ -59,6 +62,7 @@ class Shapes:
     theirs: Array
     images: Numbers
     gaps: Array
+    touches: Numbers
 
 
 def compare_shapes(c: Comparison) -> dict[int, int]:
@@ -107,7 +111,15 @@ def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
         _features(model, c.image, geoms, np.eye(3), extent),
         np.full(len(geoms), -1),
         np.full(len(geoms), np.inf),
+        _contact_labels(model)[geoms],
     )
+
+
+def _contact_labels(model: MjModel) -> Numbers:
+    """Equal numbers for geoms of equal contact parameters, ``(ngeom,)``."""
+    fields = [np.asarray(getattr(model, f"geom_{f}"), dtype=float) for f in _CONTACT]
+    values = np.concatenate([field.reshape(model.ngeom, -1) for field in fields], axis=1)
+    return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, extent: float) -> Array:
@@ -132,7 +144,8 @@ def _pair_link(s: Shapes, mine: dict[int, Numbers], theirs: dict[int, Numbers]) 
     """Pair each geom of a link with one of its kind on the link's image."""
     for kind, rows in mine.items():
         columns = theirs.get(kind, np.array([], dtype=np.intp))
-        one, other = pair(s.mine[rows], s.theirs[columns], s.geoms[rows], s.geoms[columns])
+        labels = s.touches[rows], s.touches[columns]
+        one, other = pair(s.mine[rows], s.theirs[columns], s.geoms[rows], s.geoms[columns], labels)
         one, other = rows[one], columns[other]
         s.images[one] = s.geoms[other]
         s.gaps[one] = np.abs(s.mine[one] - s.theirs[other]).max(axis=1, initial=0.0)

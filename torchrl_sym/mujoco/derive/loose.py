@@ -146,7 +146,7 @@ def _exchange(
     """Take over images if the trees fit them, turned alike; whether they do."""
     if images is None:
         return False
-    usual = {b: turning.usual(b) for b in alike}
+    usual = {b: _together(turning, b) for b in alike}
     for k, (words, _) in enumerate(usual[alike[0]]):
         misfit = max(
             turning.misfit(a, b, (usual[a][k][1], usual[b][k][1]), [g])
@@ -162,6 +162,12 @@ def _exchange(
                 out.words.append(f"{', '.join(label_of(turning.model, 'body', b) for b in alike)} {words}")
             return True
     return False
+
+
+def _together(turning: Turning, tree: int) -> list[tuple[str, Array]]:
+    """Turns that are tried for all trees of a kind at once: objects may lie in any way."""
+    upright = turning.parts.data.xmat[tree].reshape(3, 3).T
+    return turning.usual(tree) + [("upright", upright)] * turning.is_object(tree)
 
 
 def _buckets(turning: Turning) -> list[list[int]]:
@@ -222,11 +228,11 @@ def _by_place(
 
 def _by_shape(turning: Turning, group: PointGroup, alike: list[int]) -> list[dict[int, int]] | None:
     """Images with the least misfit, where not every tree is its own."""
-    images = [dict(zip(alike, alike, strict=True))]
+    images, turns = [dict(zip(alike, alike, strict=True))], {b: _together(turning, b) for b in alike}
     for g in range(1, group.order):
         table = np.array([
             [min(turning.misfit(a, b, (one[1], other[1]), [g])
-                 for one, other in zip(turning.usual(a), turning.usual(b), strict=True)) for b in alike]
+                 for one, other in zip(turns[a], turns[b], strict=True)) for b in alike]
             for a in alike
         ])  # fmt: skip
         rows, columns = linear_sum_assignment(np.minimum(table, 1e6))
