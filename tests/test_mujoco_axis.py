@@ -18,7 +18,7 @@ from torchrl_sym.mujoco import SymmetryError, audit, derive
     [
         "",
         'euler="0 0 .5"',
-        'euler="1.5707963 0 .4"',
+        'euler="1.57079632679 0 .4"',
         'quat=".7 .1 -.5 .3"',
     ],
 )

@@ -78,3 +78,12 @@ def test_mirrored_objects_that_lie_anyhow_change_places():
         return _outcome(mujoco.MjModel.from_xml_string(f"<mujoco><worldbody>{pair}</worldbody></mujoco>"))
 
     assert outcome(-1) == "exact" and outcome(1) == "no"
+
+
+def test_a_small_object_is_judged_by_its_own_size():
+    xml = """<mujoco><worldbody><body pos="0 0 2"><freejoint/><geom size="1"/></body>
+      <body name="cube" pos="2 1 .1"><freejoint/><geom type="box" size=".03 .03 .03"/></body>
+      </worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    assert audit(model, PointGroup.rotation(3)).outcome == "no"
+    assert audit(model, PointGroup.rotation(4)).outcome == "exact"

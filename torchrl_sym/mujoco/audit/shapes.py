@@ -53,6 +53,7 @@ class Shapes:
         theirs: support functions where images are looked for, ``(n, d)``.
         images: numbers of the geoms that they go to, -1 for none.
         gaps: largest distance of each image from the geom that it goes to, infinite for none.
+        sizes: what the image of each is relative to.
         touches: numbers of how they touch; equal for equal contact parameters.
     """
 
@@ -63,6 +64,7 @@ class Shapes:
     images: Numbers
     gaps: Array
     touches: Numbers
+    sizes: Array
 
 
 def compare_shapes(c: Comparison) -> dict[int, int]:
@@ -102,17 +104,26 @@ def _untouched(model: MjModel, lonely: Numbers) -> str:
 
 
 def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
-    model, turn, extent = c.model, c.matcher.matrix, c.matcher.extent
-    world = weld_ids(model)[model.geom_bodyid[geoms]] == 0
+    model, turn = c.model, c.matcher.matrix
+    owners = weld_ids(model)[model.geom_bodyid[geoms]]
+    world, sizes = owners == 0, _sizes(c, owners)
+    moved = np.array([c.map.bodies.get(int(b), int(b)) for b in owners])
     return Shapes(
         geoms,
         np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision")),
-        _features(model, c.data, geoms, turn, extent),
-        _features(model, c.image, geoms, np.eye(3), extent),
+        _features(model, c.data, geoms, turn, _sizes(c, moved)),
+        _features(model, c.image, geoms, np.eye(3), sizes),
         np.full(len(geoms), -1),
         np.full(len(geoms), np.inf),
         _contact_labels(model)[geoms],
+        _sizes(c, moved),
     )
+
+
+def _sizes(c: Comparison, links: Numbers) -> Array:
+    """What shapes of links are relative to: of an object beside a robot, its own size."""
+    known = {link: c.matcher.size(link) for link in set(links.tolist())}
+    return np.array([known[link] for link in links.tolist()])
 
 
 def _contact_labels(model: MjModel) -> Numbers:
@@ -122,13 +133,13 @@ def _contact_labels(model: MjModel) -> Numbers:
     return np.unique(values, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, extent: float) -> Array:
-    """Support functions of the images of geoms, relative to a scale; of planes, normal and height."""
-    out = geom_supports(model, pose, geoms, DIRECTIONS @ turn) / extent
+def _features(model: MjModel, pose: MjData, geoms: Numbers, turn: Array, sizes: Array) -> Array:
+    """Support functions of the images of geoms, relative to sizes; of planes, normal and height."""
+    out = geom_supports(model, pose, geoms, DIRECTIONS @ turn) / sizes[:, None]
     planes = np.flatnonzero(model.geom_type[geoms] == PLANE)
     normals = pose.geom_xmat[geoms[planes]].reshape(-1, 3, 3)[:, :, 2]
     out[planes, :3] = normals @ turn.T
-    out[planes, 3] = (normals * pose.geom_xpos[geoms[planes]]).sum(axis=1) / extent
+    out[planes, 3] = (normals * pose.geom_xpos[geoms[planes]]).sum(axis=1) / sizes[planes]
     return out
 
 
@@ -160,7 +171,8 @@ def _look_among(c: Comparison, s: Shapes, mine: dict[int, Numbers], idle: dict[i
         centers = c.data.geom_xpos[s.geoms[rest]] @ c.matcher.matrix.T
         apart = KDTree(centers).query(c.image.geom_xpos[others])[0]
         others = others[apart <= DISCRETE * c.matcher.extent]  # meshes for the eye are large
-        there = _features(c.model, c.image, others, np.eye(3), c.matcher.extent)
+        owners = weld_ids(c.model)[c.model.geom_bodyid[others]]
+        there = _features(c.model, c.image, others, np.eye(3), _sizes(c, owners))
         one, other = pair(s.mine[rest], there, s.geoms[rest], others)
         gaps = np.abs(s.mine[rest[one]] - there[other]).max(axis=1, initial=0.0)
         fit = gaps <= DISCRETE
@@ -183,9 +195,9 @@ def _cover_link(c: Comparison, s: Shapes, mine: dict[int, Numbers], theirs: dict
         reach = _reach(c, geom, s.geoms[cover])
         radius, extent = c.model.geom_rbound[geom], c.matcher.extent
         allowed = max(_STICKS_OUT * radius, min(_PIECE * radius, _A_LITTLE * extent))
-        if reach > allowed or reach / c.matcher.extent > s.gaps[i] / 2:
+        if reach > allowed or reach / s.sizes[i] > s.gaps[i] / 2:
             return
-        s.gaps[i] = reach / c.matcher.extent
+        s.gaps[i] = reach / s.sizes[i]
         nearest = cover[np.abs(s.theirs[cover] - s.mine[i]).max(axis=1).argmin()]
         if s.images[i] < 0:
             s.images[i] = s.geoms[nearest]  # whose contact parameters it must have
@@ -220,4 +232,4 @@ def _name(c: Comparison, s: Shapes, i: int) -> str:
         return f"{label} (no image)"
     gaps = np.abs(s.theirs[candidates] - s.mine[i]).max(axis=1)
     nearest = geom_label(c.model, int(s.geoms[candidates[gaps.argmin()]]))
-    return f"{label} (no image; {nearest} is nearest, {1e3 * c.matcher.extent * gaps.min():.3g} mm off)"
+    return f"{label} (no image; {nearest} is nearest, {1e3 * s.sizes[i] * gaps.min():.3g} mm off)"
