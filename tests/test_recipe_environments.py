@@ -32,7 +32,7 @@ def serial(*, num_envs, seed):
 
 def processes(*, num_envs, seed):
     make = functools.partial(TASK, num_envs=num_envs // 2, seed=seed)
-    return ParallelEnv(2, make, mp_start_method="spawn")
+    return ParallelEnv(2, make)
 
 
 @pytest.mark.parametrize("make_env", [transformed, serial, pytest.param(processes, marks=pytest.mark.slow)])

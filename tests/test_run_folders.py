@@ -2,10 +2,7 @@
 
 import dataclasses
 import functools
-import os
-import signal
-import subprocess
-import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ import torch
 
 import tasks
 from tasks.environment import BatchedEnv
+from tests.launch import Script
 from torchrl_sym.recipes import PPOConfig, RunFolder, export_actor, load_actor, read_metrics, train
 from torchrl_sym.recipes.table import MetricsTable
 
@@ -55,15 +53,14 @@ for row in train(config, make_env, make_env(num_envs=1).symmetry, folder=sys.arg
 
 
 def test_one_process_trains_in_a_folder_and_a_kill_gives_it_up(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", HOLDER, str(tmp_path)]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE) as holder:
-        assert holder.stdout is not None
-        holder.stdout.readline()
-        config = dataclasses.replace(TINY, iterations=10**6)
-        with pytest.raises(BlockingIOError, match=f"process {holder.pid} holds"):
-            train(config, MAKE_ENV, SYMMETRY, folder=tmp_path)
-        holder.send_signal(signal.SIGKILL)
+    holder = Script(HOLDER, tmp_path)
+    while not holder.output()[0]:
+        assert holder.process.is_alive(), holder.output()
+        time.sleep(0.01)
+    config = dataclasses.replace(TINY, iterations=10**6)
+    with pytest.raises(BlockingIOError, match=f"process {holder.process.pid} holds"):
+        train(config, MAKE_ENV, SYMMETRY, folder=tmp_path)
+    holder.kill()
     done = RunFolder(tmp_path).load()["iteration"]
     training = train(config, MAKE_ENV, SYMMETRY, folder=tmp_path)
     assert next(training)["iteration"] == done + 1
@@ -255,9 +252,7 @@ train(config, make_env, make_env(num_envs=1).symmetry, folder=sys.argv[1]).run()
 
 def test_a_full_disk_keeps_the_last_checkpoint(folder):
     before = (folder / "checkpoint.pt").read_bytes()
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-c", FULL, str(folder), str(len(before) // 2)]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    result = Script(FULL, folder, len(before) // 2).wait()
     assert result.returncode != 0 and "File too large" in result.stderr
     assert (folder / "checkpoint.pt").read_bytes() == before
     assert {path.name for path in folder.iterdir()} == {"checkpoint.pt", "metrics.csv", "lock"}

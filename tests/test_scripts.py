@@ -1,10 +1,7 @@
 """Every script runs with tiny settings, and so does the code in the README."""
 
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +10,7 @@ from PIL import Image
 import results_page
 from comparison import study
 from comparison.robot_tables import tables
+from tests.launch import Script
 from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -21,9 +19,7 @@ TINY = ["--config.iterations", "2", "--config.num-envs", "8", "--config.horizon"
 
 def run(script: str, *arguments: str) -> str:
     """Output of a script, which must succeed."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / script), *map(str, arguments)]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
+    result = Script(ROOT / script, *arguments).wait()
     assert result.returncode == 0, result.stderr[-3000:]
     return result.stdout
 

@@ -359,9 +359,9 @@ def ddp_rank(rank, store, result, finished):
 @pytest.mark.slow
 def test_two_processes_have_the_gradient_of_one(tmp_path):
     result = tmp_path / "gradients.pt"
-    finished = torch.multiprocessing.get_context("spawn").Barrier(2)
+    finished = torch.multiprocessing.get_context("forkserver").Barrier(2)
     arguments = (f"file://{tmp_path / 'store'}", str(result), finished)
-    torch.multiprocessing.spawn(ddp_rank, arguments, nprocs=2)
+    torch.multiprocessing.start_processes(ddp_rank, arguments, nprocs=2, start_method="forkserver")
     loss = ddp_loss()
     out = loss(batch_of(12))
     sum(value for name, value in out.items() if name.startswith("loss_")).backward()
