@@ -1,14 +1,13 @@
 """benchmarks/compare.py from the outside: it draws everything, survives kills, and reports what failed."""
 
 import collections
+import contextlib
 import csv
 import dataclasses
+import io
 import json
 import math
-import os
 import shutil
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -25,6 +24,7 @@ from comparison.files import write_json
 from comparison.reruns import marks
 from comparison.run import Run
 from tasks.settings import SETTINGS
+from tests.launch import Script, serve
 from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -59,26 +59,29 @@ def lost(num_envs, seed):
 """
 
 
-def command(folder: Path, *arguments: str) -> list[str]:
+def command(*arguments: str) -> list[str]:
     where = ["--folder", "runs", "--output", "results", "--plots", "plots"]
     if "--preset" not in arguments:
         where += ["--episodes", "2"]
-    return [sys.executable, str(ROOT / "benchmarks" / "compare.py"), *where, *arguments]
+    return [*where, *arguments]
 
 
-def environment() -> dict[str, str]:
-    return os.environ | {"PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg", "OMP_NUM_THREADS": "1"}
-
-
-def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess:
-    options = {"cwd": folder, "env": environment(), "capture_output": True, "text": True, "timeout": 500}
-    return subprocess.run(arguments, **options)
+def main(folder: Path, script, *arguments: str) -> int:
+    """A script's main in this process, whose workers are forked from a server that is running already."""
+    serve()
+    sys.modules.pop("mine", None)  # another test's
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setattr(sys, "path", [*sys.path])
+        patch.setattr(sys, "argv", [script.__file__, *arguments])
+        return script.main(tyro.cli(script.Arguments))
 
 
 def compare(folder: Path, *arguments: str, expected: int = 0) -> str:
-    result = run(command(folder, *arguments), folder)
-    assert result.returncode == expected, result.stdout[-2000:] + result.stderr[-3000:]
-    return result.stdout + result.stderr
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+        assert main(folder, compare_script, *command(*arguments)) == expected
+    return output.getvalue()
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -87,10 +90,11 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_smoke_draws_every_figure_of_every_task(tmp_path):
-    started = time.monotonic()
+def test_smoke_draws_every_figure_of_every_task(tmp_path, monkeypatch):
+    for name, setting in SETTINGS.items():  # whole episodes of robots are most of its time
+        short = {what: {**task, "episode_seconds": 0.5} for what, task in setting.evaluations.items()}
+        monkeypatch.setitem(SETTINGS, name, dataclasses.replace(setting, evaluations=short))
     compare(tmp_path, "--preset", "smoke")
-    assert time.monotonic() - started < 300  # 180 s on two cores that have nothing else to do
     drawn = {path.name: path.stat().st_size for path in (tmp_path / "plots" / "smoke").iterdir()}
     assert set(drawn) == {f"{name}.png" for name in FIGURES} | {"tables.md"}
     assert all(drawn[f"{name}.png"] > 10_000 for name in FIGURES)
@@ -107,14 +111,12 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     for folder in (whole, killed):
         folder.mkdir()
     compare(whole, *what)
-    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen(command(killed, *what), cwd=killed, env=environment(), **quiet)
+    script = Script(ROOT / "benchmarks" / "compare.py", *command(*what), folder=killed)
     table = killed / "runs" / "custom" / "cartpole" / "ppo" / "seed_0" / "stage_0" / "metrics.csv"
     while not table.exists() or len(table.read_text().splitlines()) < 5:
-        assert process.poll() is None
+        assert script.process.is_alive(), script.output()
         time.sleep(0.05)
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
+    script.kill()
     assert not (killed / "results").exists()
     time.sleep(0.5)
     size = table.stat().st_size
@@ -137,21 +139,15 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     assert compare_script.main(dataclasses.replace(asked, methods=("loss-1",))) == 1
 
 
-def test_results_are_extended_where_the_runs_are_gone(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_results_are_extended_where_the_runs_are_gone(tmp_path):
     what = ["--methods", "ppo", "--steps", str(8 * 25 * 2), *TINY]
-
-    def here(*arguments):  # in this process, which is faster where nothing is trained
-        return compare_script.main(
-            tyro.cli(compare_script.Arguments, args=command(tmp_path, *arguments)[2:])
-        )
 
     compare(tmp_path, *what, "--seeds", "1")
     results = tmp_path / "results" / "custom"
     before = {path.name: path.read_text() for path in results.iterdir()}
     shutil.rmtree(tmp_path / "runs")
     shutil.rmtree(tmp_path / "plots")
-    assert here(*what, "--seeds", "1", "--collect") == 0
+    compare(tmp_path, *what, "--seeds", "1", "--collect")
     assert before == {path.name: path.read_text() for path in results.iterdir()}
     assert (tmp_path / "plots" / "custom" / "tables.md").exists()
     compare(tmp_path, *what, "--seeds", "2", "--extend")
@@ -169,7 +165,7 @@ def test_results_are_extended_where_the_runs_are_gone(tmp_path, monkeypatch):
         with pytest.raises(
             ValueError, match="results/custom to hold cartpole ppo 0 as it is asked for now"
         ):
-            here(*what, "--seeds", "3", *other, "--extend")
+            compare(tmp_path, *what, "--seeds", "3", *other, "--extend")
     assert after == {path.name: path.read_text() for path in results.iterdir()}
 
 
@@ -286,11 +282,9 @@ def test_presets():
 
 
 def test_tuning_gives_every_family_the_same(tmp_path):
-    script = str(ROOT / "benchmarks" / "tune.py")
     tiny = ["--families", "ppo", "aug", "--candidates", "2", "--steps", "1", "--episodes", "1"]
     where = ["--folder", "runs", "--output", "results"]
-    result = run([sys.executable, script, *tiny, *where], tmp_path)
-    assert result.returncode == 0, result.stderr[-3000:]
+    assert main(tmp_path, tune, *tiny, *where) == 0
     runs = {(row["method"], row["seed"]) for row in rows(tmp_path / "results" / "runs.csv")}
     for family in ("ppo", "aug"):
         assert len([m for m, _ in runs if m.startswith(f"{family}: ")]) == 2 * 2 + 2 * 3
@@ -355,7 +349,7 @@ def test_augmentation_is_twenty_times_as_symmetric_and_no_worse():
 
 
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):
-    with RunFolder(tmp_path / "runs" / "custom"):
-        output = compare(tmp_path, "--methods", "ppo", *TINY, "--steps", "1", expected=1)
-    assert "expected a folder that nobody trains in" in output
+    refused = pytest.raises(BlockingIOError, match="expected a folder that nobody trains in")
+    with RunFolder(tmp_path / "runs" / "custom"), refused:
+        compare(tmp_path, "--methods", "ppo", *TINY, "--steps", "1")
     assert not (tmp_path / "results").exists()
