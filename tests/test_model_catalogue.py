@@ -13,6 +13,13 @@ from catalogue import expectations, run, sources
 from catalogue.examine import Row, examine
 from catalogue.page import bugs, page, still_there
 from tests.catalogue_models import MODELS, expect, mjcf
+from tests.launch import serve
+
+
+@pytest.fixture(scope="module", autouse=True)
+def server():
+    """Of processes, which imports less than the catalogue's own, and runs already."""
+    serve()
 
 
 @pytest.mark.parametrize("name", MODELS)

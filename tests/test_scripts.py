@@ -5,11 +5,14 @@ import re
 from pathlib import Path
 
 import pytest
+import tyro
 from PIL import Image
 
 import results_page
+import speed
 from comparison import study
 from comparison.robot_tables import tables
+from tasks.settings import SETTINGS
 from tests.launch import Script
 from torchrl_sym.recipes import RunFolder
 
@@ -169,10 +172,12 @@ def test_what_policies_do_is_drawn_from_the_stored_ones(tmp_path, name, task, ki
 
 
 @pytest.mark.slow
-def test_speed_writes_its_figures(tmp_path):
+def test_speed_writes_its_figures(tmp_path, monkeypatch):
+    small = SETTINGS["cartpole"].replace(num_envs=8, horizon=8)  # otherwise it trains whole iterations
+    monkeypatch.setitem(SETTINGS, "cartpole", small)
     figures = tmp_path / "speed.json"
     tiny = ["--tasks", "cartpole", "--rounds", "1", "--settle", "1", "--num-envs", "8", "--rows", "32"]
-    run("benchmarks/speed.py", *tiny, "--output", figures)
+    speed.main(tyro.cli(speed.Arguments, args=[*tiny, "--output", str(figures)]))
     results = json.loads(figures.read_text())
     assert results["env"][0]["env_over_raw"] > 0
     assert {row["order"] for row in results["loss"]} == {1, 2, 4}
