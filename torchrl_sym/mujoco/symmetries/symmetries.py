@@ -65,7 +65,8 @@ def symmetries(
     check_model(model)
     checks.real("tolerance", tolerance, 0.0)
 
-    search = _Search(model, keyframe, axis, tolerance, tuple(carried))
+    names = [carried] if isinstance(carried, str) else checks.sequence("carried", carried)
+    search = _Search(model, keyframe, axis, tolerance, tuple(names))
     turns = search.turns()
     mirrors = search.mirrors(max(turns, default=1))
     group = search.largest(turns, mirrors, ("exact", "approximate"))
