@@ -1,11 +1,19 @@
-"""Imports the packages before pytest collects their doctests.
+"""Off-screen rendering, and the packages, before pytest collects anything.
 
 In its import mode "importlib", pytest executes a module that nobody has imported yet and sets it as an
 attribute of its package: of `torchrl_sym.mujoco`, where `derive` is a function, the module of that name.
 """
 
 import contextlib
+import ctypes.util
 import importlib
+import os
+import sys
+
+# MuJoCo and dm_control read MUJOCO_GL when they are imported, and dm_control refuses a value that cannot
+# work, so EGL is only asked for where it exists.
+if sys.platform == "linux" and ctypes.util.find_library("EGL"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
 
 for package in ("torchrl_sym", "torchrl_sym.mujoco", "tasks"):
     with contextlib.suppress(ImportError):  # the core is tested without the others

@@ -22,7 +22,7 @@ from torch import Tensor
 from tasks.base import Entry, Task, register
 from tasks.draws import draws
 from tasks.state import State
-from torchrl_sym import PointGroup
+from torchrl_sym import PointGroup, checks
 
 # Desired cart velocity at full action, m/s. The paper gives no limit.
 MAX_CART_VELOCITY = 3.0
@@ -34,6 +34,8 @@ ANGLE_SCALE = math.pi
 START_ANGLE = math.pi / 2
 # Half-width of the uniform noise on the start angle (rad) and on both velocities (m/s, rad/s).
 START_NOISE = 0.1
+# Density of the air that a wind moves, kg/m^3; without wind there is none, and no drag.
+AIR_DENSITY = 1.2
 
 
 @register
@@ -46,6 +48,10 @@ class CartPole(Task):
 
     Args:
         episode_seconds: length of an episode, s; None for 4 s.
+        motor_bias: velocity of the cart that is added to every command, m/s, for studies of asymmetry: the
+            task is no longer symmetric, though its observations and actions still transform as declared.
+        rail_tilt: by which the rail falls towards +x, degrees, for such studies.
+        wind: velocity of the air towards +x, m/s, for such studies; it has drag then.
 
     Example:
         >>> import torch
@@ -65,8 +71,26 @@ class CartPole(Task):
     goal_names = ("right", "left")
     task_terms = ("angle",)
 
-    def __init__(self, *, episode_seconds: float | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        episode_seconds: float | None = None,
+        motor_bias: float = 0.0,
+        rail_tilt: float = 0.0,
+        wind: float = 0.0,
+    ) -> None:
+        self.motor_bias = checks.real("motor_bias", motor_bias, -MAX_CART_VELOCITY, MAX_CART_VELOCITY)
+        slope = math.radians(checks.real("rail_tilt", rail_tilt, -45.0, 45.0))
+        wind = checks.real("wind", wind, -50.0, 50.0)
         super().__init__(PointGroup.reflection("x"), episode_seconds=episode_seconds)
+
+        # asymmetries come after the symmetry has been derived, from the model that designers have in mind
+        option = self.model.opt
+        if slope:
+            weight = -option.gravity[2]
+            option.gravity[:] = weight * math.sin(slope), 0.0, -weight * math.cos(slope)
+        if wind:
+            option.wind[:], option.density = (wind, 0.0, 0.0), AIR_DENSITY
         self._velocity_scale = torch.tensor(VELOCITY_SCALE, dtype=torch.float64)
 
     def layout(self) -> tuple[Entry, ...]:
@@ -89,7 +113,7 @@ class CartPole(Task):
 
     def control(self, action: Tensor, state: State) -> Tensor:
         """Desired cart velocity, m/s."""
-        return action.clamp(-1.0, 1.0).mul_(MAX_CART_VELOCITY)
+        return action.clamp(-1.0, 1.0).mul_(MAX_CART_VELOCITY).add_(self.motor_bias)
 
     def observe(self, state: State) -> Tensor:
         """Cart velocity, pole angle and pole velocity, each over its scale.

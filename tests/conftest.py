@@ -1,15 +1,8 @@
-"""Settings that hold for every test: one torch thread, off-screen rendering, a quiet TorchRL."""
+"""Settings that hold for every test: one torch thread, a quiet TorchRL."""
 
-import ctypes.util
 import logging
 import multiprocessing
 import os
-import sys
-
-# dm_control reads MUJOCO_GL when it is imported and refuses a value that cannot work, so EGL is
-# only asked for where it exists.
-if sys.platform == "linux" and ctypes.util.find_library("EGL"):
-    os.environ.setdefault("MUJOCO_GL", "egl")
 
 import pytest
 import torch

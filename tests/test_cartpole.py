@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from tasks.cartpole import CartPole
 from tasks.state import State
 from tests.task_helpers import make
+from torchrl_sym.mujoco import verify
 
 
 def cartpole_state(angle, velocity=(0.0, 0.0)):
@@ -76,3 +77,44 @@ def test_cartpole_follows_the_clipped_desired_velocity():
     state = env.task.control(torch.tensor([[7.0], [-9.0], [torch.nan]]), env.state)
     assert state[:2].squeeze(-1).tolist() == [3.0, -3.0]
     assert state[2].isnan()
+
+
+ASYMMETRIES = [{"motor_bias": 0.3}, {"rail_tilt": 3.0}, {"wind": 5.0}]
+
+
+def rollout(actions, start, **arguments):
+    """Observations after constant commands, from one start."""
+    env = make("cartpole", num_envs=len(start.qpos), **arguments)
+    env.reset_to(start)
+    for action in actions:
+        out = env.step(
+            TensorDict(action=torch.full((len(start.qpos), 1), action), batch_size=env.batch_size)
+        )
+    return out["next", "observation"]
+
+
+@pytest.mark.parametrize("asymmetry", ASYMMETRIES, ids=str)
+def test_verify_finds_an_asymmetry_in_the_dynamics(asymmetry):
+    env = make("cartpole", num_envs=8, **asymmetry)
+    report = verify(env, env.symmetry, tolerance=1e-9, states=8)
+    assert report.worst.part == "dynamics" and report.worst.value > 1e-3, str(report)
+
+
+@pytest.mark.parametrize("asymmetry", ASYMMETRIES, ids=str)
+def test_the_opposite_asymmetry_is_the_mirror_image(asymmetry):
+    start = CartPole().sample_goal_state(4, torch.Generator().manual_seed(0))
+    opposite = {name: -value for name, value in asymmetry.items()}
+    here = rollout([0.5, -0.2, 0.1], start, **asymmetry)
+    there = rollout([-0.5, 0.2, -0.1], CartPole().transform_state(start, "reflect-x"), **opposite)
+    torch.testing.assert_close(here, -there, rtol=0, atol=1e-6)
+    assert (here - rollout([0.5, -0.2, 0.1], start)).abs().max() > 1e-3
+
+
+def test_asymmetries_are_those_that_they_are_called():
+    upright = cartpole_state([0.0])
+    assert CartPole(motor_bias=0.25).control(torch.tensor([[5.0]]), upright).item() == 3.25
+    tilted = CartPole(rail_tilt=30.0).model.opt.gravity
+    assert tilted.tolist() == pytest.approx([9.81 / 2, 0.0, -9.81 * 3**0.5 / 2])
+    assert rollout([0.0], upright, rail_tilt=3.0)[0, 1] > 0, "the pole falls towards the lower end"
+    assert rollout([0.0], upright, wind=5.0)[0, 1] > 0, "the pole falls with the wind"
+    assert CartPole().model.opt.density == 0.0, "no drag where no wind is asked for"

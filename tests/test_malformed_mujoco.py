@@ -1,4 +1,4 @@
-"""Malformed models, keyframes, bodies and numbers are refused by derive, audit, symmetrize and verify."""
+"""Malformed models, keyframes, bodies, axes and numbers are refused by every verb for MuJoCo models."""
 
 import copy
 import functools
@@ -25,7 +25,15 @@ from tests.malformed import (
 )
 from torchrl_sym import PointGroup, Symmetry
 from torchrl_sym import representations as r
-from torchrl_sym.mujoco import audit, derive, symmetrize, symmetrize_with_report, verify
+from torchrl_sym.mujoco import (
+    audit,
+    derive,
+    infer,
+    symmetries,
+    symmetrize,
+    symmetrize_with_report,
+    verify,
+)
 from torchrl_sym.mujoco.__main__ import named_group
 
 LEGS = "".join(
@@ -79,7 +87,21 @@ spec = thing(
 keyframe = optional(choice("home", beyond=MODEL.nkey, negative=-1)).but("a number")
 carried = names(["cube", "goal"], fixed=["world"], hinged=["leg0"]).but("one text", "empty", "one twice")
 tolerance = number(1e-2)
-shared = {"group": group, "keyframe": keyframe, "tolerance": tolerance, "carried": carried}
+axis = Argument(
+    None,
+    {
+        "one number": 0.1,
+        "of three": (0.0, 0.0, 0.0),
+        "of text": ("0", "0"),
+        "text": "xy",
+        "not a number": (0.0, np.nan),
+        "infinite": (np.inf, 0.0),
+        "a flag": True,
+        "nested": [[0.0, 0.0]],
+    },
+)
+found = {"keyframe": keyframe, "axis": axis, "tolerance": tolerance, "carried": carried}
+shared = {"group": group, **found}
 qpos, qvel, ctrl = (torch.zeros(2, size) for size in (MODEL.nq, MODEL.nv, MODEL.nu))
 rows = {
     "flags": torch.tensor([True, False]),
@@ -96,6 +118,20 @@ def vectors(right: torch.Tensor) -> Argument:
 SUBJECTS = [
     subject("derive", derive, model=model, **shared),
     subject("audit", audit, model=model, **shared),
+    subject("symmetries", symmetries, model=model, **found),
+    subject(
+        "infer",
+        infer,
+        env=thing(ENV, model=MODEL),
+        group=thing(ENV.symmetry.group, **{"of another kind": r.polar(GROUP), "a name": "reflect-x"}),
+        keyframe=Argument(None, keyframe.wrong),
+        axis=axis,
+        carried=Argument((), carried.wrong),
+        samples=count(24, low=12, **{"a billion": 10**9}),
+        seed=count(2, low=0, huge=2**70),
+        tolerance=number(1e-4),
+        observe=optional(function(lambda observation: observation)),
+    ),
     subject("symmetrize", symmetrize, spec=spec, **shared),
     subject("symmetrize_with_report", symmetrize_with_report, spec=spec, **shared),
     subject(

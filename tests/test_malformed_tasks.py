@@ -101,7 +101,13 @@ elements = Argument(
 SUBJECTS = [
     subject("create", base.create, name=choice("cartpole")),
     subject(
-        "cartpole", functools.partial(base.create, "cartpole"), "episode_seconds", episode_seconds=seconds
+        "cartpole",
+        functools.partial(base.create, "cartpole"),
+        "episode_seconds motor_bias rail_tilt wind",
+        episode_seconds=seconds,
+        motor_bias=number(0.1, low=-3.0, wide=4.0),
+        rail_tilt=number(2.0, low=-45.0, wide=90.0),
+        wind=number(2.0, low=-50.0, wide=99.0),
     ),
     subject(
         "anymal_push",

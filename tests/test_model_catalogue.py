@@ -65,23 +65,29 @@ def test_left_and_right_are_paired_by_words_of_names(sides, name, image):
 
 def test_names_without_a_side_stay_and_a_name_of_one_side_alone_may_go_anywhere():
     entry = expect([("left", "right")], reflect_y="exact")
-    assert entry.complaints({"reflect-y": "exact"}, {"left_camera": "eye_2", "neck": "neck"}) == []
-    assert entry.complaints({"reflect-y": "exact"}, {"neck": "head", "head": "neck"}) == [
+    assert entry.complaints({"reflect-y": "exact"}, [{"left_camera": "eye_2", "neck": "neck"}]) == []
+    assert entry.complaints({"reflect-y": "exact"}, [{"neck": "head", "head": "neck"}]) == [
         "reflect-y: neck goes to head, expected neck",
         "reflect-y: head goes to neck, expected head",
     ]
 
 
+def test_an_actuator_that_is_called_as_a_joint_is_looked_for_among_actuators():
+    entry = expect([("left", "right")], reflect_y="exact")
+    joints, actuators = {"left": "right", "right": "left"}, {"right": "right"}
+    assert entry.complaints({"reflect-y": "exact"}, [joints, actuators]) == []
+
+
 def test_an_element_that_nobody_asks_for_is_judged_if_it_is_expected():
     found = {"reflect-y": "no", "reflect-30": "approximate"}
-    assert expect().complaints(found, {}) == []
-    assert expect(**{"reflect-30": "exact"}).complaints(found, {}) == [
+    assert expect().complaints(found, []) == []
+    assert expect(**{"reflect-30": "exact"}).complaints(found, []) == [
         "reflect-30: expected exact, got approximate"
     ]
 
 
 def test_an_element_that_was_expected_and_not_tried_is_said():
-    assert expect(rot_90="exact").complaints({"reflect-y": "no"}, {}) == [
+    assert expect(rot_90="exact").complaints({"reflect-y": "no"}, []) == [
         "rot-90: expected exact, not found"
     ]
 

@@ -57,6 +57,22 @@ def test_without_a_group_all_are_tried(pair):
     assert "exact" in lines
 
 
+@pytest.mark.parametrize("free_base", [False, True])
+@pytest.mark.parametrize("name", ["notes.txt", "robot.urdf", "robot.xml"])
+def test_files_that_are_no_models_are_refused(tmp_path, name, free_base, capsys):
+    path = tmp_path / name
+    path.write_text("no <robot")
+    assert main(Arguments(path, free_base=free_base)) == 2
+    assert "expected an MJCF or URDF file" in capsys.readouterr().err
+
+
+def test_options_without_effect_are_refused(pair, tmp_path, capsys):
+    assert main(Arguments(pair(), plane=20.0)) == 2
+    assert "beside --plane" in capsys.readouterr().err
+    assert main(Arguments(pair(), out=tmp_path / "nowhere" / "robot.xml")) == 2
+    assert "make it first" in capsys.readouterr().err
+
+
 def test_differences_are_named_and_missing_symmetries_fail(pair, capsys):
     assert main(Arguments(pair(1.02), group="reflect-y")) == 0
     assert "approximate (largest residual" in capsys.readouterr().out

@@ -121,5 +121,8 @@ def test_tied_std_makes_the_policy_symmetric_in_its_scale():
         torch.nn.init.uniform_(actor.get_parameter("module.0.module.log_std"), -1.0, 0.0)
         scale = actor.get_dist(TASK(num_envs=2, seed=0).reset()).base_dist.scale
         assert bool((scale[:, 0] == scale[:, 1]).all()) is equal
-    with pytest.raises(ValueError, match="dense block"):
-        make_actor(config, ["observation"], 3, 3, polar(PointGroup.rotation(3)))
+    turned = make_actor(config, ["observation"], 3, 3, polar(PointGroup.rotation(3)))
+    torch.nn.init.uniform_(turned.get_parameter("module.0.module.log_std"), -1.0, 0.0)
+    scale = turned.get_dist(TASK(num_envs=2, seed=0).reset()).base_dist.scale
+    assert bool((scale[:, 0] == scale[:, 1]).all()), "x and y are mixed by a turn"
+    assert not bool((scale[:, 0] == scale[:, 2]).any())

@@ -23,7 +23,7 @@ from torchrl_sym.recipes import (
     read_metrics,
     train,
 )
-from torchrl_sym.recipes.networks import make_networks
+from torchrl_sym.recipes.networks import gaussian, make_networks
 from torchrl_sym.recipes.normalizers import RewardScale, observe
 from torchrl_sym.recipes.table import TIMING
 from torchrl_sym.representations import polar, pseudoscalar
@@ -111,10 +111,10 @@ def test_normalised_networks_stay_equivariant_under_the_group():
     observe(
         actor, TensorDict(observation=torch.randn(50, 3) * torch.tensor([1, 5, 2]) + 3, batch_size=[50])
     )
-    mean = next(m for m in actor.modules() if hasattr(m, "linear"))
+    mean = gaussian(actor).mean
     with torch.no_grad():
-        mean.linear[0].weight.copy_(torch.eye(3))
-        mean.linear[0].bias.zero_()
+        mean.net[0].weight.copy_(torch.eye(3))
+        mean.net[0].bias.zero_()
     assert_equivariant(mean, polar(group), polar(group))
     assert norm.count == 50
 

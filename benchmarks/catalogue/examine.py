@@ -10,7 +10,7 @@ from typing import Any
 from catalogue.expectations import Expectation
 from catalogue.sources import load
 from torchrl_sym import PointGroup
-from torchrl_sym.mujoco import derive, symmetries
+from torchrl_sym.mujoco import ModelSymmetry, derive, symmetries
 
 GROUPS = {
     "reflect-x": PointGroup.reflection("x"),
@@ -64,11 +64,15 @@ def examine(key: str, path: Path, expected: Expectation | None) -> dict[str, Any
         if worst is not None and worst.residual > audit.tolerance:
             row.worst[candidate.name] = f"{worst.residual:.2g}, {worst.term} of {worst.name}"
     if expected is not None:
-        images: dict[str, str] = {}
+        images: list[dict[str, str]] = []
         if row.verdicts.get(expected.mirror) in ("exact", "approximate") and expected.sides:
             robot = derive(loaded.model, GROUPS[expected.mirror])
-            for kind in ("joint", "actuator"):
-                table = robot.table(kind, expected.mirror)
-                images |= {name: image.lstrip("+-") for name, image in table.items()}
+            images = [_named(robot, kind, expected.mirror) for kind in ("joint", "actuator")]
         row.against = expected.complaints(row.verdicts, images)
     return asdict(row)
+
+
+def _named(robot: ModelSymmetry, kind: str, element: str) -> dict[str, str]:
+    """Images of what has a name of its own, without signs."""
+    table = robot.table(kind, element)
+    return {name: image.lstrip("+-") for name, image in table.items() if not name.startswith(f"{kind} ")}

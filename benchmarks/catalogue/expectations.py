@@ -7,7 +7,7 @@ something it does not know of.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -49,8 +49,8 @@ class Expectation:
                 return name[: found.start()] + token.removeprefix("^") + name[found.end() :]
         return name
 
-    def complaints(self, verdicts: Mapping[str, str], images: Mapping[str, str]) -> list[str]:
-        """What disagrees: verdicts by element, and images of named things under the mirror.
+    def complaints(self, verdicts: Mapping[str, str], images: Sequence[Mapping[str, str]]) -> list[str]:
+        """What disagrees: verdicts by element, and images of named things under the mirror, kind by kind.
 
         Elements that nobody asks for are judged if they are expected. A name that has no counterpart
         (`left_camera`, or `left_hip_link` beside `right_hip`) may go anywhere.
@@ -66,14 +66,14 @@ class Expectation:
             for element, expected in self.has.items()
             if element not in verdicts and "no" not in expected.split("|")
         ]
-        if not self.sides:
-            return said
-        expected = {name: self.image(name) for name in images}
-        return said + [
-            f"{self.mirror}: {name} goes to {image}, expected {expected[name]}"
-            for name, image in images.items()
-            if image != expected[name] and expected[name] in images
-        ]
+        for table in images if self.sides else ():
+            expected = {name: self.image(name) for name in table}
+            said += [
+                f"{self.mirror}: {name} goes to {image}, expected {expected[name]}"
+                for name, image in table.items()
+                if image != expected[name] and expected[name] in table
+            ]
+        return said
 
 
 def _word(token: str) -> str:

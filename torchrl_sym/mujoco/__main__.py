@@ -106,6 +106,13 @@ class _NoSymmetry(Exception):
 
 
 def _answers(arguments: Arguments) -> Iterator[str]:
+    if arguments.plane and arguments.group is None:
+        raise ValueError(
+            "expected --group beside --plane, which turns its mirrors; without, all planes are tried"
+        )
+    if arguments.out is not None and not arguments.out.parent.is_dir():
+        raise ValueError(f"expected a folder to write to, {arguments.out.parent} is none; make it first")
+
     spec = load_spec(arguments.model, arguments.free_base)
     model = spec.compile()
     where: dict[str, Any] = {"axis": arguments.axis, "carried": arguments.carried}
@@ -150,4 +157,4 @@ def _write(arguments: Arguments, spec: Any, group: PointGroup, where: dict[str, 
 
 
 if __name__ == "__main__":
-    sys.exit(main(tyro.cli(Arguments)))
+    sys.exit(main(tyro.cli(Arguments, prog="python -m torchrl_sym.mujoco")))

@@ -70,8 +70,17 @@ class PPOConfig:
     max_learning_rate: float = 1e-2
     """Upper end of the adaptive learning rate."""
 
+    network: Literal["mlp", "equivariant", "relaxed"] = "mlp"
+    """Kind of actor and critic: ordinary; equivariant and invariant for any parameters, which needs no
+    copies (``augmentation="none"``); or relaxed, equivariant when training begins and free to depart."""
+    initialization: Literal["default", "symmetric"] = "default"
+    """Initial weights of an ordinary network: PyTorch's, or their projection onto symmetric ones, scaled to
+    the same norms."""
+    relaxation_coeff: float = 1e-2
+    """Price of departing: weight of the sum of squares of a relaxed network's free weights."""
     hidden: tuple[int, ...] = (32, 32)
-    """Sizes of the hidden layers of actor and critic (ELU)."""
+    """Sizes of the hidden layers of actor and critic (ELU), rounded up to multiples of the group's order
+    where they are copies of its regular representation (all but ordinary networks of default weights)."""
     initial_std: float = 1.0
     """Standard deviation of the policy at the start; it is learned, and does not depend on the state."""
     min_std: float = 0.05
@@ -83,7 +92,7 @@ class PPOConfig:
     then, and the initial one and its bounds have no effect. None: learned."""
     tie_std: bool = False
     """Give actions that the group exchanges (left and right knee) one standard deviation; without it, a
-    policy is symmetric in its mean only."""
+    policy is symmetric in its mean only. Equivariant networks always do."""
     weight_scale: float = 1.0
     """Factor on PyTorch's uniform initialisation of the actor (the paper's initialisation study)."""
     last_layer_scale: float = 1.0
@@ -130,6 +139,11 @@ class PPOConfig:
                 raise ValueError(
                     f"{low}: expected at most {high} = {getattr(self, high)}, got {getattr(self, low)}"
                 )
+        if self.network != "mlp" and self.initialization != "default":
+            raise ValueError(
+                f"initialization: expected 'default' for network={self.network!r}, which is symmetric when "
+                f"training begins, got {self.initialization!r}"
+            )
         if not self.min_std <= self.initial_std <= self.max_std:
             raise ValueError(
                 f"initial_std: expected a number from min_std to max_std, [{self.min_std}, "
@@ -175,12 +189,15 @@ class PPOConfig:
 _CHOICES = {
     "augmentation": ("none", "all", "random", "naive"),
     "adapt_every": ("minibatch", "iteration"),
+    "network": ("mlp", "equivariant", "relaxed"),
+    "initialization": ("default", "symmetric"),
     "autocast": ("bfloat16",),
 }
 _RANGES: dict[str, dict[str, float]] = {
     "gamma": {"low": 0, "high": 1},
     "lmbda": {"low": 0, "high": 1},
     "mirror_coeff": {"low": 0},
+    "relaxation_coeff": {"low": 0},
     "critic_coeff": {"low": 0},
     "entropy_coeff": {"low": 0},
     "clip_epsilon": {"above": 0, "high": math.nextafter(1, 0)},

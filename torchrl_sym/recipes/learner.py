@@ -19,6 +19,7 @@ from torchrl.objectives.value import GAE
 
 from torchrl_sym.augment import SymmetryAugment
 from torchrl_sym.mirror_loss import MirrorLoss
+from torchrl_sym.recipes.architectures import relaxation
 from torchrl_sym.recipes.compilation import compiled
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.networks import gaussian
@@ -122,7 +123,11 @@ class Learner:
     def _evaluate(self, minibatch: TensorDictBase) -> dict[str, Tensor]:
         """All losses of a minibatch and their diagnostics."""
         with self._precision():
-            return {key: value for loss in self.losses for key, value in loss(minibatch).items()}
+            out = {key: value for loss in self.losses for key, value in loss(minibatch).items()}
+        departed = relaxation([self.actor, self.critic])
+        if departed is not None:
+            out["loss_relaxation"] = self.config.relaxation_coeff * departed
+        return out
 
     def _precision(self) -> torch.autocast | nullcontext:
         if self.config.autocast is None:

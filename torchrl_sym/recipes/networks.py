@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,22 +13,21 @@ from tensordict import NestedKey
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
+from torchrl.modules import IndependentNormal, ProbabilisticActor
 
 from torchrl_sym.normalization import SymmetricNorm
+from torchrl_sym.recipes.architectures import make_net, scale_weights
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.keyed import KeyedModule
-from torchrl_sym.representations import Representation
+from torchrl_sym.representations import Representation, scalar
 from torchrl_sym.symmetry import Symmetry
 
 
 class FeedForward(nn.Module):
-    """ELU network on its concatenated inputs, which are cast to its own precision.
+    """A network on its concatenated inputs, which are cast to its own precision.
 
     Args:
-        in_size: number of inputs.
-        out_size: number of outputs.
-        hidden: sizes of the hidden layers.
+        net: what computes.
         scale: factor on the outputs.
         norm: normalises the inputs first.
         event_dims: number of event dimensions of each input. Defaults to one each.
@@ -34,9 +35,7 @@ class FeedForward(nn.Module):
 
     def __init__(
         self,
-        in_size: int,
-        out_size: int,
-        hidden: Sequence[int],
+        net: nn.Module,
         scale: float = 1.0,
         *,
         norm: SymmetricNorm | None = None,
@@ -44,12 +43,7 @@ class FeedForward(nn.Module):
     ) -> None:
         super().__init__()
         self.scale, self.norm, self.event_dims = scale, norm, event_dims
-        self.net = MLP(in_size, out_size, num_cells=list(hidden), activation_class=nn.ELU)
-
-    @property
-    def linear(self) -> list[nn.Linear]:
-        """The layers with weights, first to last."""
-        return [layer for layer in self.net if isinstance(layer, nn.Linear)]
+        self.net = net
 
     def forward(self, *inputs: Tensor) -> Tensor:
         if self.norm is not None:
@@ -75,7 +69,7 @@ class Gaussian(nn.Module):
         size: number of actions.
         bounds: lower and upper bound of the standard deviation.
         tied_by: the action's representation, to give equal deviations to actions that symmetric elements
-            exchange (a mean of log_std over the orbit).
+            exchange or mix (a mean of log_std over them).
     """
 
     def __init__(
@@ -90,11 +84,12 @@ class Gaussian(nn.Module):
         self.mean = mean
         self.log_std = nn.Parameter(torch.full((size,), math.log(std)))
         self.bounds = (math.log(bounds[0]), math.log(bounds[1]))
-        self.tie = None if tied_by is None else tied_by.absolute()
+        self.register_buffer("tie", None if tied_by is None else _means(tied_by), persistent=False)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         loc = self.mean(*inputs)
-        log_std = self.log_std if self.tie is None else self.tie.orbit(self.log_std).mean(0)
+        tie = self.get_buffer("tie")
+        log_std = self.log_std if tie is None else tie.to(self.log_std) @ self.log_std
         return loc, log_std.exp().expand_as(loc)
 
     @torch.no_grad()
@@ -114,6 +109,12 @@ class Gaussian(nn.Module):
             self.log_std.fill_(math.log(std))
 
 
+def _means(action: Representation) -> Tensor:
+    """The matrix that replaces each entry by the mean of those that it is exchanged or mixed with."""
+    same = action.components[:, None] == action.components
+    return same.float() / same.sum(1, keepdim=True)
+
+
 def gaussian(actor: nn.Module) -> Gaussian:
     """The network of an actor of :func:`make_actor`."""
     return next(module for module in actor.modules() if isinstance(module, Gaussian))
@@ -126,6 +127,7 @@ def make_actor(
     out_size: int,
     action: Representation | None = None,
     *,
+    observation: Representation | None = None,
     norm: SymmetricNorm | None = None,
     event_dims: Sequence[int] | None = None,
 ) -> ProbabilisticTensorDictSequential:
@@ -136,7 +138,9 @@ def make_actor(
         in_keys: what it reads.
         in_size: number of entries it reads.
         out_size: number of actions.
-        action: representation of the action, needed for ``config.tie_std``.
+        action: representation of the action, needed for ``config.tie_std`` and for networks that are
+            symmetric.
+        observation: representation of the concatenated inputs, needed for networks that are symmetric.
         norm: of its inputs, needed for ``config.normalize_observations``.
         event_dims: number of event dimensions of each input. Defaults to one each.
 
@@ -144,16 +148,12 @@ def make_actor(
         ValueError: the configuration normalises observations, and there is no ``norm``.
     """
     _require_norm(config, norm)
-    net = FeedForward(
-        in_size, out_size, config.hidden, config.output_scale, norm=norm, event_dims=event_dims
-    )
-    with torch.no_grad():
-        for layer in net.linear:
-            scale = config.weight_scale * (config.last_layer_scale if layer is net.linear[-1] else 1.0)
-            layer.weight.mul_(scale)
-            layer.bias.mul_(scale)
+    net = make_net(config, in_size, out_size, observation, action)
+    scale_weights(net, config.weight_scale, config.last_layer_scale)
+    mean = FeedForward(net, config.output_scale, norm=norm, event_dims=event_dims)
     bounds = (config.min_std, config.max_std)
-    policy = Gaussian(net, config.initial_std, out_size, bounds, action if config.tie_std else None)
+    tied_by = action if config.tie_std or config.network == "equivariant" else None
+    policy = Gaussian(mean, config.initial_std, out_size, bounds, tied_by)
     return ProbabilisticActor(
         KeyedModule(policy, list(in_keys), ["loc", "scale"]),
         in_keys=["loc", "scale"],
@@ -167,12 +167,15 @@ def make_critic(
     in_keys: Sequence[NestedKey],
     in_size: int,
     *,
+    observation: Representation | None = None,
     norm: SymmetricNorm | None = None,
     event_dims: Sequence[int] | None = None,
 ) -> KeyedModule:
     """State value on the concatenated inputs; arguments as of :func:`make_actor`."""
     _require_norm(config, norm)
-    net = FeedForward(in_size, 1, config.hidden, norm=norm, event_dims=event_dims)
+    value = None if observation is None else scalar(observation.group)
+    net = make_net(config, in_size, 1, observation, value)
+    net = FeedForward(net, norm=norm, event_dims=event_dims)
     return KeyedModule(net, list(in_keys), ["state_value"])
 
 
@@ -230,6 +233,9 @@ def _inputs(
 ) -> tuple[int, dict[str, Any]]:
     """Number of entries under some keys, and what a network has to know about them."""
     events = [env.observation_spec[key].shape[env.batch_dims :] for key in keys]
-    norm = SymmetricNorm(*(symmetry[key] for key in keys)) if config.normalize_observations else None
+    reps = [symmetry[key] for key in keys]
+    norm = SymmetricNorm(*reps) if config.normalize_observations else None
     event_dims = None if all(len(event) == 1 for event in events) else [len(event) for event in events]
-    return sum(event.numel() for event in events), {"norm": norm, "event_dims": event_dims}
+    observation = functools.reduce(operator.add, [rep.flatten() for rep in reps])
+    about = {"observation": observation, "norm": norm, "event_dims": event_dims}
+    return sum(event.numel() for event in events), about

@@ -7,6 +7,7 @@ from torchrl_sym.representations.images import image
 from torchrl_sym.representations.items import items
 from torchrl_sym.representations.orientations import quaternion, rotation_6d, rotation_matrix
 from torchrl_sym.representations.permutations import permutation, signed_permutation
+from torchrl_sym.representations.regular import regular
 from torchrl_sym.representations.vectors import (
     axial,
     heading,
@@ -32,6 +33,7 @@ __all__ = [
     "polar",
     "pseudoscalar",
     "quaternion",
+    "regular",
     "rotation_6d",
     "rotation_matrix",
     "scalar",

@@ -24,13 +24,27 @@ def load_spec(path: str | Path, free_base: bool = False) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
     if not free_base:
-        return mj.MjSpec.from_file(str(path))
-    root = ET.parse(path).getroot() if path.suffix != ".xml" or _is_urdf(path) else None
+        return _parsed(path)
+    try:
+        root = ET.parse(path).getroot() if path.suffix != ".xml" or _is_urdf(path) else None
+    except ET.ParseError as error:
+        raise _unreadable(path, error) from error
     if root is not None and root.tag == "robot":
         return _free_urdf(path, root)
-    spec = mj.MjSpec.from_file(str(path))
+    spec = _parsed(path)
     free_the_base(spec)
     return spec
+
+
+def _parsed(path: Path) -> Any:
+    try:
+        return mj.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> ValueError:
+    return ValueError(f"expected an MJCF or URDF file, {path} is none that can be read: {error}")
 
 
 def free_the_base(spec: Any) -> None:

@@ -65,7 +65,8 @@ def symmetries(
     check_model(model)
     checks.real("tolerance", tolerance, 0.0)
 
-    search = _Search(model, keyframe, axis, tolerance, tuple(carried))
+    names = [carried] if isinstance(carried, str) else checks.sequence("carried", carried)
+    search = _Search(model, keyframe, axis, tolerance, tuple(names))
     turns = search.turns()
     mirrors = search.mirrors(max(turns, default=1))
     group = search.largest(turns, mirrors, ("exact", "approximate"))
@@ -104,17 +105,16 @@ class _Search:
             robot = derive(self.model, group, self.keyframe, axis=self.axis, carried=self.carried)
         except SymmetryError as error:
             return None, refused(self.model, group, self.tolerance, str(error))
+        if _TURNED in robot.pose:  # it is another plane of the robot's own frame, and is tried there
+            reason = f"only with the base turned: {robot.pose}"
+            return None, refused(self.model, group, self.tolerance, reason)
         return robot, audit_derived(robot, self.tolerance)
 
     def examine(self, group: PointGroup, usual: bool) -> Candidate:
         """Audit the group that an element generates; elements that people ask for are reported always."""
         (robot, report), name, moves = self.look(group), group.names[1], False
         if robot is not None and report.outcome in ("exact", "approximate"):
-            if _TURNED in robot.pose:  # it is another plane of the robot's own frame, and is tried there
-                reason = f"only with the base turned: {robot.pose}"
-                report = AuditReport(report.elements, (), self.tolerance, reason)
-            else:
-                moves = _moves(robot, 1)
+            moves = _moves(robot, 1)
         candidate = Candidate(name, report, moves)
         if candidate.found or usual:
             self.tried[name] = candidate
