@@ -5,10 +5,12 @@
     python benchmarks/models.py --only "menagerie/unitree_*"   a part of it, printed
 
 Every model is examined in a process of its own, with a time limit: what does not compile, hangs or fails is
-a row of the page and stops nothing. The exit status is 1 if a verdict, or a pair of left and right, is
-against benchmarks/catalogue/expectations.toml.
+a row of the page and stops nothing. Rows are kept in a file as they come, so that a run that was stopped
+goes on from there. The exit status is 1 if a verdict, or a pair of left and right, is against
+benchmarks/catalogue/expectations.toml.
 """
 
+import contextlib
 import sys
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -38,6 +40,8 @@ class Arguments:
     """Patterns of keys to examine; with them the page is printed, not written."""
     out: Path = DOCS / "models.md"
     """Where the page goes."""
+    rows: Path = Path("runs/models.jsonl")
+    """Where rows are kept as they come; delete it to examine everything anew."""
     workers: int = 2
     """Processes at a time."""
     limit: float = 60.0
@@ -46,8 +50,10 @@ class Arguments:
 
 def versions(found: list[sources.Source]) -> str:
     """What the page was made of."""
-    packages = [source.name for source in found if source.name in sources.PACKAGES]
-    numbers = [f"{name.replace('_', '-')} {metadata.version(name)}" for name in packages]
+    numbers = []
+    for source in found:
+        with contextlib.suppress(metadata.PackageNotFoundError):  # a folder, not a package
+            numbers.append(f"{source.name.replace('_', '-')} {metadata.version(source.name)}")
     return f"MuJoCo {mujoco.__version__}; {', '.join(numbers)}.\n"
 
 
@@ -61,9 +67,10 @@ def main(arguments: Arguments) -> int:
         for key, path in source.files()
         if not arguments.only or any(fnmatchcase(key, pattern) for pattern in arguments.only)
     ]
-    rows = examine_all(jobs, arguments.workers, arguments.limit)
+    about = versions(found)
+    rows = examine_all(jobs, arguments.workers, arguments.limit, arguments.rows)
 
-    text = page(rows, wanted, found, versions(found))
+    text = page(rows, wanted, found, about)
     if arguments.only:
         print(text)
     else:

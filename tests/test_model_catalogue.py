@@ -146,11 +146,19 @@ def test_what_hangs_dies_or_fails_stops_nothing(tmp_path, monkeypatch):
     for name, text in {**texts, "arena": mjcf("")}.items():
         (tmp_path / f"{name}.xml").write_text(text)
     jobs = [(f"ours/{name}", tmp_path / f"{name}.xml", None) for name in ("robot", "broken", "arena")]
-    rows = run.examine_all(jobs, workers=2, limit=60)
+    kept = tmp_path / "rows.jsonl"
+    rows = run.examine_all(jobs, workers=2, limit=60, kept=kept)
     assert [row.key for row in rows] == ["ours/robot", "ours/broken"]
     assert rows[0].verdicts["rot-120"] == "exact" and rows[0].error == ""
     assert rows[1].error.startswith("does not compile: ")
-    assert [row.error for row in run.examine_all(jobs[:1], workers=1, limit=0)] == ["took more than 0 s"]
+    assert [row.error for row in run.examine_all(jobs[:1], 1, 0, tmp_path / "none")] == [
+        "took more than 0 s"
+    ]
+
+    whole = kept.read_text()
+    kept.write_text(whole + '["ours/cut", {"key')  # killed while it wrote
+    assert run.examine_all(jobs, 2, 60, kept) == rows, "what is known is not examined again"
+    assert kept.read_text().startswith(whole) and len(kept.read_text().splitlines()) == 4
 
 
 def test_a_process_that_dies_and_an_error_of_the_library_are_rows(monkeypatch):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
+import json
 import multiprocessing
 import sys
 import time
@@ -21,19 +24,21 @@ from torchrl_sym.recipes.workers import end_with_parent
 Job = tuple[str, Path, Expectation | None]
 
 
-def examine_all(jobs: Sequence[Job], workers: int, limit: float) -> list[Row]:
+def examine_all(jobs: Sequence[Job], workers: int, limit: float, kept: Path) -> list[Row]:
     """Rows of all files that are whole models, in order.
 
     Args:
         jobs: keys, paths, and what is expected.
         workers: processes at a time.
         limit: seconds for each, compilation included.
+        kept: file of rows that are known already, to which new ones are added.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["catalogue.examine"])
-    waiting, rows = list(jobs), {}
+    rows = _known(kept)
+    waiting = [job for job in jobs if job[0] not in rows]
     active: dict[Connection, tuple[str, Any, float]] = {}
-    bar = tqdm(total=len(jobs), unit="file", disable=None)
+    bar = tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit="file", disable=None)
     while waiting or active:
         while waiting and len(active) < workers:
             key, path, expected = waiting.pop(0)
@@ -55,8 +60,25 @@ def examine_all(jobs: Sequence[Job], workers: int, limit: float) -> list[Row]:
             del active[connection]
             bar.update()
             _say(rows[key])
+            _keep(kept, key, rows[key])
     bar.close()
     return [rows[key] for key, _, _ in jobs if rows[key] is not None]
+
+
+def _known(kept: Path) -> dict[str, Row | None]:
+    """Rows by key; None for files that are pieces of others. A last line that was cut off is left out."""
+    rows: dict[str, Row | None] = {}
+    for line in kept.read_text().splitlines() if kept.exists() else ():
+        with contextlib.suppress(json.JSONDecodeError):
+            key, row = json.loads(line)
+            rows[key] = None if row is None else Row(**row)
+    return rows
+
+
+def _keep(kept: Path, key: str, row: Row | None) -> None:
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with kept.open("a") as file:
+        file.write(json.dumps([key, None if row is None else dataclasses.asdict(row)]) + "\n")
 
 
 def _say(row: Row | None) -> None:
