@@ -68,10 +68,14 @@ def examine_all(jobs: Sequence[Job], workers: int, limit: float, kept: Path) -> 
 def _known(kept: Path) -> dict[str, Row | None]:
     """Rows by key; None for files that are pieces of others. A last line that was cut off is left out."""
     rows: dict[str, Row | None] = {}
-    for line in kept.read_text().splitlines() if kept.exists() else ():
+    text = kept.read_text() if kept.exists() else ""
+    for line in text.splitlines():
         with contextlib.suppress(json.JSONDecodeError):
             key, row = json.loads(line)
-            rows[key] = None if row is None else Row(**row)
+            tuples = {} if row is None else {name: tuple(row[name]) for name in ("axis", "stand_ins")}
+            rows[key] = None if row is None else Row(**row | tuples)
+    if text and not text.endswith("\n"):
+        kept.write_text(f"{text}\n")
     return rows
 
 
