@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from tensordict import TensorDictBase
+from torchrl.objectives import LossModule
 
 from tests.point_groups import GROUPS, random
 from torchrl_sym import PointGroup, Representation
@@ -48,3 +50,23 @@ def disturb(module) -> None:
         for name, parameter in module.named_parameters():
             if "free" in name:
                 parameter.normal_(std=0.1)
+
+
+def assert_same_losses(loss: LossModule, plain: LossModule, batch: TensorDictBase) -> None:
+    """Copies change neither a loss nor a gradient."""
+    found = []
+    for each in (loss, plain):
+        each.zero_grad()
+        out = each(batch)
+        terms = [out[key] for key in ("loss_objective", "loss_critic", "loss_entropy")]
+        sum(terms).backward()
+        found.append(([term.detach() for term in terms], [p.grad.clone() for p in each.parameters()]))
+    assert_near(found[0][0], found[1][0])
+    assert_near(found[0][1], found[1][1])
+    assert any(grad.abs().max() > 1e-3 for grad in found[0][1])
+    assert loss(batch)["loss_mirror"] < 1e-10
+
+
+def assert_near(some, others) -> None:
+    for one, other in zip(some, others, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-6)

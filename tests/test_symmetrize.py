@@ -141,13 +141,20 @@ def test_layers_of_which_nothing_is_left_are_refused():
         symmetrize_(nn.Linear(1, 1), scalar(group), scalar(GROUPS["K4"]))
 
 
-def test_training_on_asymmetric_data_leaves_symmetry_as_it_may():
-    """The module is an ordinary one afterwards: the check of equivariance can fail."""
+@pytest.mark.parametrize("on_copies", [True, False])
+def test_copies_of_the_data_keep_the_symmetry_that_training_without_them_loses(on_copies):
     rep = entries(GROUPS["K4"])
     network = symmetrize_(MLP(rep.dim, rep.dim, num_cells=[8]).double(), rep, rep)
-    network(random(8, rep.dim)).square().sum().backward()
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter -= 0.1 * parameter.grad
-    with pytest.raises(AssertionError):
+    x, target = random(8, rep.dim), random(8, rep.dim, seed=1)
+    if on_copies:
+        x, target = (rep.orbit(each).flatten(0, 1) for each in (x, target))
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        (network(x) - target).square().mean().backward()
+        optimizer.step()
+    if on_copies:
         assert_exact(network, rep, rep)
+    else:
+        with pytest.raises(AssertionError):
+            assert_exact(network, rep, rep)
