@@ -252,6 +252,8 @@ def check_representations(in_rep: Representation, out_rep: Representation) -> No
 
 def flat_rows(x: Tensor, representation: Representation) -> tuple[torch.Size, Tensor]:
     """The shape of the batch, and its events as rows ``(B, dim)``."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"expected a tensor, got {checks.shown(x)}; use torch.as_tensor")
     if not representation.fits(x.shape):
         raise ValueError(f"expected {representation.wanted}, got a tensor of shape {tuple(x.shape)}")
     batch = x.shape[: x.ndim - len(representation.event_shape)]

@@ -91,14 +91,19 @@ class _Recurrent(nn.Module):
         return weights
 
     def _run(self, x: Tensor, states: Sequence[Tensor] | None, mask: Tensor | None) -> list[Tensor]:
-        if x.ndim != 3 or x.shape[-1] != self.input_size:
+        if not isinstance(x, Tensor) or x.ndim != 3 or x.shape[-1] != self.input_size:
             raise ValueError(
-                f"expected sequences (batch, time, {self.input_size}), got a tensor of shape "
-                f"{tuple(x.shape)}"
+                f"expected sequences (batch, time, {self.input_size}), got {checks.shown(x)}; a single "
+                "step is a sequence of one"
             )
-        if states is None:
-            zero = x.new_zeros(self.num_layers, x.shape[0], self.hidden_size)
-            states = [zero] * self.states
+        shape = self.num_layers, x.shape[0], self.hidden_size
+        given = [] if states is None else checks.sequence("hx", states, "states")
+        right = [isinstance(state, Tensor) and state.shape == shape for state in given]
+        if len(given) not in (0, self.states) or not all(right):
+            raise ValueError(f"hx: expected {self.states} of shape {shape}, got {checks.shown(states)}")
+        if mask is not None and mask.shape != x.shape[:2]:
+            raise ValueError(f"mask: expected shape {tuple(x.shape[:2])}, got {checks.shown(mask)}")
+        states = given or [x.new_zeros(shape)] * self.states
         settings = self._weights(), self.bias, self.num_layers, 0.0, self.training, False
         if mask is None:
             return [*self._kernel([x], states, *settings, True)]
