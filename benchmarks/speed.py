@@ -5,9 +5,9 @@
 
 Every table compares our code with its limit in one run: environments with raw physics, losses with plain
 ClipPPOLoss and with bare torch of the same arithmetic, augmentation with a copy of memory, iterations of
-training with rsl_rl's (where it is installed, see peer.py), audits with derive. The variants of
-a row are timed in turn, round by round, so that a machine that slows down slows all of them; a figure is
-the median over rounds, a ratio the median of the rounds' ratios. One torch thread.
+training with rsl_rl's (where it is installed, see peer.py), audits with derive, equivariant networks with
+dense ones. The variants of a row are timed in turn, round by round, so that a machine that slows down slows
+all of them; a figure is the median over rounds, a ratio the median of the rounds' ratios. One torch thread.
 """
 
 import functools
@@ -39,6 +39,7 @@ from torchrl.objectives import ClipPPOLoss
 
 import tasks
 from audits import measure_audits
+from equivariant import measure_compiled, measure_equivariant
 from iterations import measure_iterations, measure_options
 from measuring import cell, interleave, ratio, show
 from peer import INSTALLED
@@ -53,8 +54,11 @@ LOSS = {"clip_epsilon": 0.2, "entropy_coeff": 0.01, "critic_coeff": 1.0, "loss_c
 class Arguments:
     """Measure and print ratios."""
 
-    only: Literal["env", "loss", "augment", "audit", "iteration", "options"] | None = None
-    """One of the tables; that of options, which compiles for minutes, is made only if it is asked for."""
+    only: (
+        Literal["env", "loss", "augment", "audit", "networks", "networks_compiled", "iteration", "options"]
+        | None
+    ) = None
+    """One of the tables; those that compile for minutes are made only if they are asked for."""
     tasks: tuple[str, ...] = tasks.ALL_TASKS
     """Tasks whose environments are timed."""
     rounds: int = 15
@@ -331,7 +335,7 @@ def measure_augmentation(arguments: Arguments) -> list[dict]:
 
 
 def measure_rows(arguments: Arguments, measure: Callable) -> list[dict]:
-    """A table of iterations.py or audits.py."""
+    """A table of iterations.py, audits.py or equivariant.py."""
     print(f"\n{measure.__doc__}")
     table = []
     for row in measure(arguments.tasks, arguments.rounds):
@@ -345,9 +349,14 @@ TABLES: dict[str, Callable[[Arguments], list[dict]]] = {
     "loss": measure_losses,
     "augment": measure_augmentation,
     "audit": functools.partial(measure_rows, measure=measure_audits),
+    "networks": functools.partial(measure_rows, measure=measure_equivariant),
+    "networks_compiled": functools.partial(measure_rows, measure=measure_compiled),
     "iteration": functools.partial(measure_rows, measure=measure_iterations),
     "options": functools.partial(measure_rows, measure=measure_options),
 }
+
+
+COMPILING = ("networks_compiled", "options")
 
 
 def main(arguments: Arguments) -> None:
@@ -355,7 +364,7 @@ def main(arguments: Arguments) -> None:
     results = {
         name: measure(arguments)
         for name, measure in TABLES.items()
-        if name == arguments.only or (arguments.only is None and name != "options")
+        if name == arguments.only or (arguments.only is None and name not in COMPILING)
     }
     made = {
         "processor": processor(),

@@ -8,7 +8,7 @@ import torch
 from tests.point_groups import GROUPS, assert_close, every_group, random
 from tests.test_representations import acted_matrices, build, every_case
 from torchrl_sym import PointGroup, Representation
-from torchrl_sym.modules.coordinates import Coordinates, kinds
+from torchrl_sym.modules.coordinates import Coordinates
 from torchrl_sym.modules.irreps import irreps
 from torchrl_sym.representations import polar, quaternion, regular
 
@@ -86,9 +86,18 @@ def test_irreps_do_not_depend_on_how_eigenvectors_come(monkeypatch):
 
 
 def basis(coordinates: Coordinates) -> torch.Tensor:
-    """The change of basis, with the rows that are filled up, ``(rows, dim)``."""
-    parts = coordinates.split(torch.eye(coordinates.dim, dtype=torch.float64))
-    return torch.cat([part.flatten(0, 2) for part in parts])
+    """The change of basis, without the rows that only fill up, ``(dim, dim)``."""
+    parts = own_rows(coordinates, coordinates.split(torch.eye(coordinates.dim, dtype=torch.float64)))
+    return torch.cat([part.flatten(0, 1) for part in parts])
+
+
+def own_rows(coordinates: Coordinates, parts: list[torch.Tensor]) -> list[torch.Tensor]:
+    """Coordinates by irreducible representation, each ``(d, copies, B)``."""
+    return [
+        part[member, :, : coordinates.multiplicity[i]]
+        for kind, part in zip(coordinates.kinds, parts, strict=True)
+        for member, i in enumerate(kind.members)
+    ]
 
 
 def check(rep: Representation, tolerance: float = 1e-12) -> None:
@@ -97,14 +106,13 @@ def check(rep: Representation, tolerance: float = 1e-12) -> None:
     q = basis(coordinates)
     assert_close(q.T @ q, torch.eye(rep.dim, dtype=torch.float64), tolerance)
     x = random(rep.dim, 3)
-    parts = coordinates.split(x)
-    assert_close(coordinates.join(parts), x, tolerance)
-    assert sum(coordinates.multiplicity) > 0
+    assert_close(coordinates.join(coordinates.split(x)), x, tolerance)
+    parts = own_rows(coordinates, coordinates.split(x))
+    in_order = [irreps(rep.group)[i] for kind in coordinates.kinds for i in kind.members]
     for g, rho in enumerate(acted_matrices(rep)):
-        images = coordinates.split(rho @ x)
-        for kind, part, image in zip(kinds(rep.group), parts, images, strict=True):
-            turned = torch.stack([irreps(rep.group)[i].matrices[g] for i in kind.members])
-            assert_close(image, torch.einsum("rij,rjmb->rimb", turned, part), tolerance)
+        images = own_rows(coordinates, coordinates.split(rho @ x))
+        for irrep, part, image in zip(in_order, parts, images, strict=True):
+            assert_close(image, torch.einsum("ij,jmb->imb", irrep.matrices[g], part), tolerance)
 
 
 @every_case

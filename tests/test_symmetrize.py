@@ -7,13 +7,11 @@ import torch
 from torch import nn
 from torchrl.modules import MLP, NoisyLinear
 
+from tests.equivariant import assert_exact, by_dtype, by_group, entries
 from tests.point_groups import GROUPS, assert_close, random
 from tests.test_isotypic import LARGE
-from tests.test_modules import PAPER, assert_exact, entries
 from torchrl_sym.modules import EquivariantMLP, symmetrize_
 from torchrl_sym.representations import items, polar, pseudoscalar, regular, scalar
-
-by_group = pytest.mark.parametrize("group", PAPER)
 
 
 def linears(network):
@@ -21,9 +19,8 @@ def linears(network):
 
 
 @by_group
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@by_dtype
 def test_networks_commute_and_keep_their_norms(group, dtype):
-    group = GROUPS[group]
     rep, out = entries(group), polar(group) + scalar(group)
     torch.manual_seed(0)
     network = MLP(rep.dim, out.dim, num_cells=[24, 48], activation_class=nn.ELU).to(dtype)
@@ -37,7 +34,7 @@ def test_networks_commute_and_keep_their_norms(group, dtype):
 
 @by_group
 def test_a_second_time_changes_nothing(group):
-    rep = entries(GROUPS[group])
+    rep = entries(group)
     network = symmetrize_(MLP(rep.dim, rep.dim, num_cells=[24]).double(), rep, rep)
     again = symmetrize_(copy.deepcopy(network), rep, rep)
     for one, other in zip(network.parameters(), again.parameters(), strict=True):
@@ -144,13 +141,20 @@ def test_layers_of_which_nothing_is_left_are_refused():
         symmetrize_(nn.Linear(1, 1), scalar(group), scalar(GROUPS["K4"]))
 
 
-def test_training_on_asymmetric_data_leaves_symmetry_as_it_may():
-    """The module is an ordinary one afterwards: the check of equivariance can fail."""
+@pytest.mark.parametrize("on_copies", [True, False])
+def test_copies_of_the_data_keep_the_symmetry_that_training_without_them_loses(on_copies):
     rep = entries(GROUPS["K4"])
     network = symmetrize_(MLP(rep.dim, rep.dim, num_cells=[8]).double(), rep, rep)
-    network(random(8, rep.dim)).square().sum().backward()
-    with torch.no_grad():
-        for parameter in network.parameters():
-            parameter -= 0.1 * parameter.grad
-    with pytest.raises(AssertionError):
+    x, target = random(8, rep.dim), random(8, rep.dim, seed=1)
+    if on_copies:
+        x, target = (rep.orbit(each).flatten(0, 1) for each in (x, target))
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
+    for _ in range(3):
+        optimizer.zero_grad()
+        (network(x) - target).square().mean().backward()
+        optimizer.step()
+    if on_copies:
         assert_exact(network, rep, rep)
+    else:
+        with pytest.raises(AssertionError):
+            assert_exact(network, rep, rep)

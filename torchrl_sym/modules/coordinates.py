@@ -16,6 +16,7 @@ are adjacent rows, and no product has to move them first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -60,16 +61,16 @@ class Coordinates:
 
     Attributes:
         multiplicity: number of copies of each irreducible representation.
-        copies: for each kind the largest of these, to which its members are filled up with zeros.
+        copies: for each kind the largest of these, to which its members are filled up.
 
     Example:
         >>> from torchrl_sym.representations import polar
         >>> coordinates = Coordinates(polar(PointGroup.reflection("y")))
         >>> coordinates.multiplicity  # x and z stay, y changes its sign
         [2, 1]
-        >>> coordinates.split(torch.tensor([[1.0], [2.0], [3.0]]))[0].flatten(1)
+        >>> coordinates.split(torch.tensor([[1.0], [2.0], [3.0]]))[0].flatten(1)  # the last one fills up
         tensor([[1., 3.],
-                [2., 0.]])
+                [2., 1.]])
     """
 
     def __init__(self, representation: Representation) -> None:
@@ -85,15 +86,15 @@ class Coordinates:
             labels += [(*each, component) for each in label for component in range(count)]
             self._sizes.append((size, count))
         order = self._order(labels, len(all_irreps))
-        self._padded = len(order) > self.dim
         entries = torch.cat(gather)
-        indices = entries, order, order.argsort()[: self.dim], entries.argsort()
+        back = order.argsort()[-self.dim :]  # behind the rows that only fill up, which are -1
+        indices = entries, order.clamp(min=0), back, entries.argsort()
         stays = torch.arange(self.dim, device="cpu")
         self._in_place = torch.equal(entries, stays), torch.equal(order, stays)
         self._constants = Constants(*indices, *matrices)
 
     def _order(self, labels: Sequence[tuple[int, ...]], count: int) -> Tensor:
-        """Where each row of the stacked kinds comes from; one that is filled up comes from row ``dim``."""
+        """Where each row of the stacked kinds comes from; -1 for those that only fill up."""
         rows: list[dict[int, list[int]]] = [{} for _ in range(count)]
         for row, (i, k, *_) in enumerate(labels):
             rows[i].setdefault(k, []).append(row)
@@ -104,26 +105,27 @@ class Coordinates:
             for i in kind.members:
                 for k in range(kind.dim):
                     own = rows[i].get(k, [])
-                    order += [*own, *[self.dim] * (most - len(own))]
+                    order += [*own, *[-1] * (most - len(own))]
         return torch.tensor(order, device="cpu")
 
     def split(self, x: Tensor) -> list[Tensor]:
-        """Coordinates of columns ``(dim, B)``: per kind, ``(members, d, copies, B)``."""
+        """Coordinates of columns ``(dim, B)``: per kind, ``(members, d, copies, B)``.
+
+        Members that have fewer copies than others are filled up with copies of other rows.
+        """
         gather, order, _, _, *matrices = self._constants.on(x.device)
-        x = x if self._in_place[0] else x.index_select(0, gather)
+        x = x if self._in_place[0] else x.contiguous().index_select(0, gather)  # of whole rows
         x = self._mixed(x, [matrix.to(x.dtype) for matrix in matrices])
-        if self._padded:
-            x = torch.nn.functional.pad(x, (0, 0, 0, 1))
         x = x if self._in_place[1] else x.index_select(0, order)
         shapes = [(len(k.members), k.dim, m) for k, m in zip(self.kinds, self.copies, strict=True)]
-        parts = x.split([a * b * c for a, b, c in shapes])
+        parts = _split(x, [math.prod(shape) for shape in shapes])
         return [part.unflatten(0, shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def join(self, parts: Sequence[Tensor]) -> Tensor:
         """The columns with these coordinates."""
         _, _, order, scatter, *matrices = self._constants.on(parts[0].device)
         flat = [part.flatten(0, 2) for part in parts]
-        x = flat[0] if len(flat) == 1 else torch.cat(flat)
+        x = _cat(flat)
         x = x if self._in_place[1] else x.index_select(0, order)
         x = self._mixed(x, [matrix.to(x.dtype).T for matrix in matrices])
         return x if self._in_place[0] else x.index_select(0, scatter)
@@ -141,12 +143,20 @@ class Coordinates:
 
     def _mixed(self, x: Tensor, matrices: Sequence[Tensor]) -> Tensor:
         """Entries of components that mix in one way, ``[size, component]``, times their matrix."""
-        parts = x.split([size * count for size, count in self._sizes])
+        parts = _split(x, [size * count for size, count in self._sizes])
         mixed = [
             part if size == 1 else (matrix @ part.reshape(size, -1)).reshape(part.shape)
             for part, (size, _), matrix in zip(parts, self._sizes, matrices, strict=True)
         ]
-        return mixed[0] if len(mixed) == 1 else torch.cat(mixed)
+        return _cat(mixed)
+
+
+def _split(x: Tensor, sizes: list[int]) -> Sequence[Tensor]:
+    return [x] if len(sizes) == 1 else x.split(sizes)
+
+
+def _cat(parts: Sequence[Tensor]) -> Tensor:
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts))
 
 
 def _components(representation: Representation) -> Iterator[tuple[Tensor, Tensor]]:

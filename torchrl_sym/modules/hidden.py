@@ -7,6 +7,7 @@ parameter for each of them, does not.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Sequence
 
@@ -47,8 +48,15 @@ def activation(activation_class: Callable[[], nn.Module]) -> nn.Module:
         TypeError: no class of modules.
         ValueError: it is not pointwise.
     """
-    module = checks.function("activation_class", activation_class)()
-    checks.instance("activation_class", module, nn.Module, "pass a class, such as nn.ELU")
+    module = None
+    if not isinstance(activation_class, nn.Module):
+        with contextlib.suppress(TypeError):  # a function of tensors
+            module = checks.function("activation_class", activation_class)()
+    if not isinstance(module, nn.Module):
+        raise TypeError(
+            "activation_class: expected a class of modules that needs no arguments, such as nn.ELU, got "
+            f"{checks.shown(activation_class)}"
+        )
     require_pointwise("activation_class", module)
     return module
 

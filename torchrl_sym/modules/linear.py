@@ -72,7 +72,7 @@ class EquivariantLinear(nn.Module):
         check_representations(in_rep, out_rep)
         self.in_rep, self.out_rep = in_rep, out_rep
         self.source, self.target = Coordinates(in_rep), Coordinates(out_rep)
-        self._directions = Constants(self.target.invariant_directions())
+        self._bias_units = Constants(1 / self.target.invariant_directions().abs().amax(0))
         self._shapes = self._matrix_shapes()
         count = sum(math.prod(shape) for shapes in self._shapes for shape in shapes)
         if count == 0:
@@ -128,7 +128,7 @@ class EquivariantLinear(nn.Module):
             parts: as :meth:`~torchrl_sym.modules.coordinates.Coordinates.split` gives them.
             bias: whether to add the bias.
         """
-        shift = self._shift() if bias and self.bias is not None else None
+        shift = self._shift() if bias else None
         found = []
         every = zip(self.source.kinds, parts, self._matrices(), self.target.copies, strict=True)
         for kind, part, weight, rows in every:
@@ -145,31 +145,43 @@ class EquivariantLinear(nn.Module):
         return found
 
     def _matrices(self) -> list[Tensor]:
-        """Per kind, one matrix for each member, ``(members, rows, columns)``, filled up with zeros."""
-        sizes = [math.prod(shape) for shapes in self._shapes for shape in shapes]
-        flat = iter(self.weight.split(sizes))
-        every = zip(self._shapes, self.target.copies, self.source.copies, strict=True)
-        return [
-            torch.stack([self._matrix(next(flat), shape, rows, columns) for shape in shapes])
-            for shapes, rows, columns in every
-        ]
+        """Per kind, one matrix for each member, ``(members, rows, columns)``; what fills up counts 0."""
+        sizes = [sum(math.prod(shape) for shape in shapes) for shapes in self._shapes]
+        flat = [self.weight] if len(sizes) == 1 else self.weight.split(sizes)
+        every = zip(flat, self._shapes, self.target.copies, self.source.copies, strict=True)
+        return [self._matrices_of(*each) for each in every]
 
-    def _matrix(self, flat: Tensor, shape: tuple[int, int, int], rows: int, columns: int) -> Tensor:
-        """The matrix of one irreducible representation; of complex type, it commutes with quarter turns."""
-        numbers, own_rows, own_columns = shape
-        unit = math.sqrt(self.in_rep.dim / max(numbers * own_columns, 1))
-        matrix = functional.pad(flat.reshape(shape) * unit, (0, columns - own_columns, 0, rows - own_rows))
+    def _matrices_of(
+        self, flat: Tensor, shapes: list[tuple[int, int, int]], rows: int, columns: int
+    ) -> Tensor:
+        numbers = shapes[0][0]
+        if all(shape == (numbers, rows, columns) for shape in shapes):
+            matrices = flat.reshape(len(shapes) * numbers, rows, columns) * self._unit(shapes[0])
+        else:
+            parts = flat.split([math.prod(shape) for shape in shapes])
+            filled = [
+                functional.pad(
+                    part.reshape(shape) * self._unit(shape), (0, columns - shape[2], 0, rows - shape[1])
+                )
+                for part, shape in zip(parts, shapes, strict=True)
+            ]
+            matrices = torch.cat(filled)
         if numbers == 1:
-            return matrix[0]
-        a, b = matrix
-        return torch.cat([torch.cat([a, -b], 1), torch.cat([b, a], 1)])
+            return matrices
+        a, b = matrices.reshape(len(shapes), 2, rows, columns).unbind(1)  # a + b J, which commutes with J
+        return torch.cat([torch.cat([a, -b], 2), torch.cat([b, a], 2)], 1)
 
-    def _shift(self) -> Tensor:
+    def _unit(self, shape: tuple[int, int, int]) -> float:
+        """What a parameter of a matrix counts: with that of nn.Linear, outputs vary as its outputs do."""
+        return math.sqrt(self.in_rep.dim / max(shape[0] * shape[2], 1))
+
+    def _shift(self) -> Tensor | None:
         """The bias in coordinates of the first kind, ``(members, rows, 1)``."""
-        assert self.bias is not None
+        if self.bias is None:
+            return None
         members, rows = len(self.target.kinds[0].members), self.target.copies[0]
-        (directions,) = self._directions.on(self.bias.device)
-        shift = self.bias / directions.abs().amax(0).to(self.bias.dtype)
+        (units,) = self._bias_units.on(self.bias.device)
+        shift = self.bias * units.to(self.bias.dtype)
         return functional.pad(shift[None, :, None], (0, 0, 0, rows - len(shift), 0, members - 1))
 
     def dense_parameters(self) -> tuple[Tensor, Tensor | None]:
@@ -240,6 +252,8 @@ def check_representations(in_rep: Representation, out_rep: Representation) -> No
 
 def flat_rows(x: Tensor, representation: Representation) -> tuple[torch.Size, Tensor]:
     """The shape of the batch, and its events as rows ``(B, dim)``."""
+    if not isinstance(x, Tensor):
+        raise TypeError(f"expected a tensor, got {checks.shown(x)}; use torch.as_tensor")
     if not representation.fits(x.shape):
         raise ValueError(f"expected {representation.wanted}, got a tensor of shape {tuple(x.shape)}")
     batch = x.shape[: x.ndim - len(representation.event_shape)]
