@@ -105,7 +105,7 @@ def _untouched(model: MjModel, lonely: Numbers) -> str:
 
 def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
     model, turn = c.model, c.matcher.matrix
-    owners = weld_ids(model)[model.geom_bodyid[geoms]]
+    owners = weld_ids(model)[model.geom_bodyid[geoms]].astype(np.intp)
     world, sizes = owners == 0, _sizes(c, owners)
     moved = np.array([c.map.bodies.get(int(b), int(b)) for b in owners])
     return Shapes(
@@ -171,7 +171,7 @@ def _look_among(c: Comparison, s: Shapes, mine: dict[int, Numbers], idle: dict[i
         centers = c.data.geom_xpos[s.geoms[rest]] @ c.matcher.matrix.T
         apart = KDTree(centers).query(c.image.geom_xpos[others])[0]
         others = others[apart <= DISCRETE * c.matcher.extent]  # meshes for the eye are large
-        owners = weld_ids(c.model)[c.model.geom_bodyid[others]]
+        owners = weld_ids(c.model)[c.model.geom_bodyid[others]].astype(np.intp)
         there = _features(c.model, c.image, others, np.eye(3), _sizes(c, owners))
         one, other = pair(s.mine[rest], there, s.geoms[rest], others)
         gaps = np.abs(s.mine[rest[one]] - there[other]).max(axis=1, initial=0.0)
