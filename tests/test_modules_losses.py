@@ -5,12 +5,12 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
-from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor
-from torchrl.objectives import ClipPPOLoss
+from torchrl.modules import MLP, IndependentNormal, ProbabilisticActor, ValueOperator
+from torchrl.objectives import ClipPPOLoss, SACLoss
 
 from tests.equivariant import assert_same_losses, by_group
 from tests.point_groups import GROUPS, assert_close, random
-from torchrl_sym import SymmetricClipPPOLoss, Symmetry
+from torchrl_sym import MirrorLoss, SymmetricClipPPOLoss, Symmetry
 from torchrl_sym.modules import (
     EquivariantLayerNorm,
     EquivariantLinear,
@@ -84,6 +84,39 @@ def test_copies_change_nothing(make, group):
 def test_copies_change_the_loss_of_a_dense_actor():
     with pytest.raises(AssertionError):
         assert_same_losses(*losses(dense, GROUPS["K4"]))
+
+
+class StateAction(nn.Module):
+    def __init__(self, rep):
+        super().__init__()
+        self.net = InvariantMLP(rep, 1, (2 * rep.group.order,))
+
+    def forward(self, observation, action):
+        return self.net(torch.cat([observation, action], -1))
+
+
+def test_an_ensemble_of_critics_in_sac_is_invariant():
+    """TorchRL draws the parameters of an ensemble anew and keeps them apart from the module."""
+    torch.manual_seed(0)
+    group = GROUPS["D3"]
+    state, action = polar(group), axial(group)
+    actor = ProbabilisticActor(
+        TensorDictModule(with_tied_scale(state, action, group), ["observation"], ["loc", "scale"]),
+        in_keys=["loc", "scale"],
+        distribution_class=IndependentNormal,
+        return_log_prob=True,
+    )
+    critic = ValueOperator(StateAction(state + action), in_keys=["observation", "action"])
+    loss = SACLoss(actor, critic, num_qvalue_nets=2, target_entropy=-3.0)
+    batch = TensorDict(observation=torch.randn(5, 3), action=torch.randn(5, 3), batch_size=[5])
+    one, other = (each.flatten_keys().values() for each in loss.qvalue_network_params.unbind(0))
+    assert not any(torch.equal(a, b) for a, b in zip(one, other, strict=True) if a.numel() > 1)
+    symmetry = Symmetry(group, {"observation": state, "action": action})
+    mirror = MirrorLoss.of(loss, "qvalue_network", symmetry=symmetry)
+    assert mirror(batch)["loss_mirror"] < 1e-10
+    for parameter in loss.qvalue_network_params.parameters():
+        nn.init.normal_(parameter)
+    assert mirror(batch)["loss_mirror"] < 1e-8
 
 
 # --- tied numbers

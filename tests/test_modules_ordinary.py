@@ -169,6 +169,24 @@ def test_onnx_has_equal_outputs(tmp_path):
     assert_close(torch.from_numpy(y), module(x).detach(), 1e-5)
 
 
+GOLDEN = {
+    "K4": [-0.885413574, -0.003618273, -0.546345744, -0.004698826, -1.343286585, -0.372889311, 0.423291412],
+    "C3": [0.542168155, 1.342062074, -0.36480002, 1.047356531, 1.783224154, 0.10924558, 0.58329118],
+    "D3": [-0.057504904, -3.0802687, -1.12549269, -6.665297507, 0.342549214, -0.008463375, 0.147854464],
+}
+
+
+@pytest.mark.parametrize("group", GOLDEN)
+def test_saved_parameters_mean_the_same_on_every_machine(group):
+    """And in every version: what a basis of an irreducible representation is must not change."""
+    module = network(GROUPS[group], dtype=torch.float64)
+    with torch.no_grad():
+        for parameter in module.parameters():
+            parameter.copy_(torch.linspace(-0.3, 0.5, parameter.numel()))
+        y = module(torch.linspace(-1, 1, module.in_rep.dim, dtype=torch.float64))
+    assert_close(y, torch.tensor(GOLDEN[group], dtype=torch.float64), 1e-6)
+
+
 def test_empty_batches_and_single_rows():
     module = network(GROUPS["D3"])
     assert module(torch.zeros(0, module.in_rep.dim)).shape == (0, module.out_rep.dim)

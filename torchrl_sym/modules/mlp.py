@@ -75,7 +75,7 @@ class EquivariantMLP(nn.Module):
         reps = [in_rep.flatten(), *hidden, out_rep.flatten()]
         self.in_rep, self.out_rep = in_rep, out_rep
         made = {"device": device, "dtype": dtype}
-        self.linears = nn.ModuleList(
+        self.linears: Sequence[EquivariantLinear] = nn.ModuleList(  # pyright: ignore[reportAttributeAccessIssue]
             EquivariantLinear(source, target, relaxed=relaxed, **made)
             for source, target in itertools.pairwise(reps)
         )

@@ -55,10 +55,10 @@ class _Recurrent(nn.Module):
         sources = [self.in_rep, *[self.out_rep] * (self.num_layers - 1)]
         made = {"device": device, "dtype": dtype}
         gates = self.out_rep * self.gates
-        self.input_linears = nn.ModuleList(EquivariantLinear(rep, gates, bias, **made) for rep in sources)
-        self.memory_linears = nn.ModuleList(
-            EquivariantLinear(self.out_rep, gates, bias, **made) for _ in sources
-        )
+        reading = [EquivariantLinear(rep, gates, bias, **made) for rep in sources]
+        remembering = [EquivariantLinear(self.out_rep, gates, bias, **made) for _ in sources]
+        self.input_linears: Sequence[EquivariantLinear] = nn.ModuleList(reading)  # pyright: ignore[reportAttributeAccessIssue]
+        self.memory_linears: Sequence[EquivariantLinear] = nn.ModuleList(remembering)  # pyright: ignore[reportAttributeAccessIssue]
         self.reset_parameters()
 
     @torch.no_grad()
@@ -110,6 +110,7 @@ class _Recurrent(nn.Module):
 
         packed = pack_padded_sequence(x, mask.sum(-1).cpu(), batch_first=True, enforce_sorted=False)
         order, back = packed.sorted_indices, packed.unsorted_indices
+        assert order is not None and back is not None  # enforce_sorted=False
         states = [state.index_select(1, order) for state in states]
         y, *states = self._kernel([packed.data, packed.batch_sizes], states, *settings)
         y = PackedSequence(y, packed.batch_sizes, order, back)
@@ -174,7 +175,7 @@ class EquivariantGRU(_Recurrent):
         return y, memory
 
     def _kernel(self, source: list[Tensor], states: Sequence[Tensor], *settings: Any) -> Sequence[Tensor]:
-        return torch.gru(*source, states[0], *settings)
+        return torch.gru(*source, states[0], *settings)  # pyright: ignore[reportCallIssue]
 
 
 class EquivariantLSTM(_Recurrent):
@@ -219,4 +220,4 @@ class EquivariantLSTM(_Recurrent):
         return y, (hidden, cell)
 
     def _kernel(self, source: list[Tensor], states: Sequence[Tensor], *settings: Any) -> Sequence[Tensor]:
-        return torch.lstm(*source, states, *settings)
+        return torch.lstm(*source, states, *settings)  # pyright: ignore[reportCallIssue]

@@ -109,8 +109,8 @@ def _projected(
     """Weight and bias that commute with the group, of the norms that they had, in float64."""
     elements = range(source.group.order)
     weight = linear.weight.double()
-    images = (target(source(weight, g).T, g).T for g in elements)
-    projected = _with_norm_of(weight, sum(images) / len(elements))
+    images = [target(source(weight, g).T, g).T for g in elements]
+    projected = _with_norm_of(weight, torch.stack(images).mean(0))
     if projected is None:
         raise ValueError(
             f"module: expected layers between representations that share an irreducible one, got {source} "
