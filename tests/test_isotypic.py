@@ -6,11 +6,12 @@ import pytest
 import torch
 
 from tests.point_groups import GROUPS, assert_close, every_group, random
-from tests.test_representations import acted_matrices, build, every_case
+from tests.test_representations import CASES, acted_matrices, build
 from torchrl_sym import PointGroup, Representation
 from torchrl_sym.modules.coordinates import Coordinates
 from torchrl_sym.modules.irreps import irreps
 from torchrl_sym.representations import polar, quaternion, regular
+from torchrl_sym.testing import assert_representation
 
 
 def turn(axis, degrees):
@@ -38,6 +39,7 @@ LARGE = {
     "C120": PointGroup.rotation(120),
     "D60": PointGroup.dihedral(60),
 }
+SOME = ("reflect-y", "C3", "K4", "C4", "D3", "D4", "C5", "cube")
 every_group_there_is = pytest.mark.parametrize("group", (GROUPS | LARGE).values(), ids=GROUPS | LARGE)
 
 
@@ -115,7 +117,7 @@ def check(rep: Representation, tolerance: float = 1e-12) -> None:
             assert_close(image, torch.einsum("ij,jmb->imb", irrep.matrices[g], part), tolerance)
 
 
-@every_case
+@pytest.mark.parametrize("name, group", [case for case in CASES if case[1] in SOME], ids=lambda v: v)
 def test_coordinates_turn_as_irreps_do(name, group):
     check(build(name, group))
 
@@ -140,6 +142,17 @@ def test_entries_of_c2_and_k4_are_exact(group):
     q = basis(Coordinates(regular(GROUPS[group])))
     assert len(q.abs().unique()) == 1
     assert_close(q.abs().unique()[0], torch.tensor(len(q) ** -0.5, dtype=torch.float64), 1e-16)
+
+
+@every_group
+def test_the_regular_representation_is_permuted_by_the_group(group):
+    rep = regular(group, 3)
+    assert_representation(rep)
+    x = random(group.order * 3).unflatten(0, (group.order, 3))
+    for g in range(group.order):
+        image = rep(x.flatten(), g).unflatten(0, (group.order, 3))
+        for h in range(group.order):
+            assert torch.equal(image[h], x[group.table[group.inverse[g], h]])
 
 
 @every_group

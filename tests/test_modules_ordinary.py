@@ -2,6 +2,8 @@
 
 import copy
 import pickle
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -163,10 +165,11 @@ def test_onnx_has_equal_outputs(tmp_path):
     module = network(GROUPS["D3"])
     x = random(4, module.in_rep.dim, dtype=torch.float32)
     path = tmp_path / "policy.onnx"
-    torch.onnx.export(module.dense(), (x,), path, dynamo=True, verbose=False, external_data=False)
-    session = runtime.InferenceSession(str(path))
-    (y,) = session.run(None, {session.get_inputs()[0].name: x.numpy()})
-    assert_close(torch.from_numpy(y), module(x).detach(), 1e-5)
+    for exported in (module, module.dense()):
+        torch.onnx.export(exported, (x,), path, dynamo=True, verbose=False, external_data=False)
+        session = runtime.InferenceSession(str(path))
+        (y,) = session.run(None, {session.get_inputs()[0].name: x.numpy()})
+        assert_close(torch.from_numpy(y), module(x).detach(), 1e-5)
 
 
 GOLDEN = {
@@ -192,3 +195,10 @@ def test_empty_batches_and_single_rows():
     assert module(torch.zeros(0, module.in_rep.dim)).shape == (0, module.out_rep.dim)
     x = torch.randn(3, module.in_rep.dim)
     assert_close(torch.stack([module(row) for row in x]), module(x), 1e-6)
+
+
+def test_code_in_the_guide():
+    guide = (Path(__file__).parents[1] / "docs" / "networks.md").read_text()
+    blocks = re.findall(r"```python\n(.*?)```", guide, flags=re.DOTALL)
+    assert len(blocks) == 4
+    exec(compile("\n".join(blocks), "networks.md", "exec"), {})
