@@ -45,6 +45,7 @@ REFUSALS = (
 # What a message of ours has: what was expected, a remedy after a semicolon, or a list of what there is.
 HELPFUL = re.compile(r"expected|did you mean|; |\[.*\]")
 DRAW = random.Random(0)
+FORMER_NAMES = ("entropy_coef", "critic_coef")  # which TorchRL itself refuses, in words of its own
 
 
 @dataclass(frozen=True)
@@ -151,9 +152,13 @@ def _is_ours(error: Exception) -> bool:
 
 
 def misspelling(name: str) -> str:
-    """A name with one letter left out, doubled or changed."""
-    at = DRAW.randrange(1, len(name))
-    return name[:at] + DRAW.choice(["", 2 * name[at], "q"]) + name[at + 1 :]
+    """A name with one letter left out, doubled or changed, which depends on nothing but the name."""
+    draw = random.Random(name)
+    while True:
+        at = draw.randrange(1, len(name))
+        wrong = name[:at] + draw.choice(["", 2 * name[at], "q"]) + name[at + 1 :]
+        if wrong not in FORMER_NAMES:
+            return wrong
 
 
 # Families by the kind of an argument.

@@ -1,5 +1,6 @@
 """Every script runs with tiny settings, and so does the code in the README."""
 
+import ast
 import json
 import re
 from pathlib import Path
@@ -34,6 +35,19 @@ def test_all_examples_are_run():
         path.name for path in (ROOT / "examples").glob("*.py") if f"examples/{path.name}" not in source
     ]
     assert not missing
+
+
+def test_scripts_begin_with_nothing_of_ours(tmp_path):
+    """They run in forks of one server, and must find their own way to what they import."""
+    text = (
+        "import os, sys\nprint(sys.argv[1:], os.getcwd())\nprint({m.split('.')[0] for m in sys.modules})\n"
+    )
+    ended = Script(text + "sys.exit(3)", "a", folder=tmp_path).wait()
+    assert ended.returncode == 3
+    where, loaded = ended.stdout.splitlines()
+    assert where == f"['a'] {tmp_path.resolve()}"
+    assert "torch" in loaded
+    assert not {"torchrl_sym", "tasks", "comparison"} & ast.literal_eval(loaded)
 
 
 def test_augment_batch():
