@@ -41,7 +41,7 @@ class Arguments:
     out: Path = DOCS / "models.md"
     """Where the page goes."""
     rows: Path = Path("runs/models.jsonl")
-    """Where rows are kept as they come; delete it to examine everything anew."""
+    """Where rows are kept as they come, until the page is written; delete it after changing the library."""
     workers: int = 2
     """Processes at a time."""
     limit: float = 60.0
@@ -68,13 +68,15 @@ def main(arguments: Arguments) -> int:
         if not arguments.only or any(fnmatchcase(key, pattern) for pattern in arguments.only)
     ]
     about = versions(found)
-    rows = examine_all(jobs, arguments.workers, arguments.limit, arguments.rows)
+    kept = None if arguments.only else arguments.rows
+    rows = examine_all(jobs, arguments.workers, arguments.limit, kept)
 
     text = page(rows, wanted, found, about)
     if arguments.only:
         print(text)
     else:
         write_whole(arguments.out, text)
+        arguments.rows.unlink(missing_ok=True)
     return int(any(row.against for row in rows))
 
 

@@ -24,18 +24,18 @@ from torchrl_sym.recipes.workers import end_with_parent
 Job = tuple[str, Path, Expectation | None]
 
 
-def examine_all(jobs: Sequence[Job], workers: int, limit: float, kept: Path) -> list[Row]:
+def examine_all(jobs: Sequence[Job], workers: int, limit: float, kept: Path | None = None) -> list[Row]:
     """Rows of all files that are whole models, in order.
 
     Args:
         jobs: keys, paths, and what is expected.
         workers: processes at a time.
         limit: seconds for each, compilation included.
-        kept: file of rows that are known already, to which new ones are added.
+        kept: file of rows that are known already, to which new ones are added; None for no file.
     """
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["catalogue.examine"])
-    rows = _known(kept)
+    rows = {} if kept is None else _known(kept)
     waiting = [job for job in jobs if job[0] not in rows]
     active: dict[Connection, tuple[str, Any, float]] = {}
     bar = tqdm(total=len(jobs), initial=len(jobs) - len(waiting), unit="file", disable=None)
@@ -60,7 +60,8 @@ def examine_all(jobs: Sequence[Job], workers: int, limit: float, kept: Path) -> 
             del active[connection]
             bar.update()
             _say(rows[key])
-            _keep(kept, key, rows[key])
+            if kept is not None:
+                _keep(kept, key, rows[key])
     bar.close()
     return [rows[key] for key, _, _ in jobs if rows[key] is not None]
 
