@@ -38,6 +38,7 @@ from torchrl_sym.recipes import PPOConfig, RunFolder
 
 HERE = Path(__file__).parent
 
+
 @dataclass
 class Arguments:
     """Compare methods, then draw figures and tables."""

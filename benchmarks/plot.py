@@ -156,7 +156,7 @@ def log_prob(study: Study):
 
 
 def initialization(study: Study):
-    """Return and symmetry loss by the initial weights, without and with a mirror loss; dashed: symmetric."""
+    """Return and symmetry loss by initial weights (dashed: symmetric), without and with a mirror loss."""
     groups: dict[tuple[str, Method], list[MethodResults]] = {}
     for task in study.values():
         for results in task.values():
@@ -224,8 +224,9 @@ def phases(study: Study):
     figure, axes = grid(math.ceil(len(shown) / columns), columns, 4.2, 2.9)
     used, unused = axes.flat[: len(shown)], axes.flat[len(shown) :]
     for axis, results in zip(used, shown, strict=True):
+        style = {"color": color(results.method), "linewidth": 0.9, "alpha": 0.8}
         for own in results.curves.values():
-            axis.plot(own["frames"] / 1e6, own["return"], color=color(results.method), linewidth=0.9, alpha=0.8)
+            axis.plot(own["frames"] / 1e6, own["return"], **style)
             entered = own[own["phase"].diff() > 0]
             axis.plot(entered["frames"] / 1e6, entered["return"], "|", color="black", markersize=9)
         axis.set(title=f"{results.task.name}: {results.label}", xlabel=STEPS)
@@ -277,7 +278,7 @@ def efficiency(study: Study):
             curves = results.progress.values()
             if not curves:
                 continue
-            ends = max(c["frames"].iloc[-1] for c in curves) / 1e6, max(c["seconds"].iloc[-1] for c in curves)
+            ends = np.max([c[["frames", "seconds"]].iloc[-1] for c in curves], axis=0) / (1e6, 1)
             for axis, reached, end in zip((top, bottom), results.crossings.T, ends, strict=True):
                 x = np.sort(reached[np.isfinite(reached)])
                 share = np.arange(len(x) + 1) / len(reached)

@@ -116,8 +116,8 @@ def page(study: Study, tuning: str, quickstart: str, robots: dict[str, Study]) -
         [benchmarks/results](../benchmarks/results); a test compares. The runs: `{command(STUDY)}` at
         {", ".join(about["revisions"])} (+: with changes on top; {versions}; {about["machine"]},
         {about["workers"]} runs at a time, threads each: {about.get("threads", 1)}; {study.trained}
-        runs, {study.hours:.1f} hours of one core in training; which run is of which commit is in `runs.csv`).
-        Draw again: `python benchmarks/plot.py {STUDY}`.""")
+        runs, {study.hours:.1f} hours of one core in training; which run is of which commit is in
+        `runs.csv`). Draw again: `python benchmarks/plot.py {STUDY}`.""")
     rule = prose("""Two methods are compared by the difference of their interquartile means
         over seeds, with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the
         side that the paper claims. *Different*: on the other side. *Not confirmed*: it contains zero.
@@ -191,9 +191,10 @@ def robot_section(name: str, study: Study) -> str:
     (of, title), about = ROBOTS[name], study.about
     task = study[of]
     made = prose(f"""`{command(name)}` at {", ".join(about["revisions"])}: {study.trained} runs of
-        {study.million_steps:.1f} million steps, {study.hours:.1f} hours of one core; {about["machine"]}. Draw again:
-        `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
-        found with augmentation and are used for all methods; none was tuned by itself.""")
+        {study.million_steps:.1f} million steps, {study.hours:.1f} hours of one core;
+        {about["machine"]}. Draw again: `python benchmarks/plot.py {name}` and
+        `python benchmarks/behaviour.py {name}`. The settings were found with augmentation and are used for
+        all methods; none was tuned by itself.""")
     losses = Evaluated(task).losses
     if losses(1):
         close = len(losses()) > 1

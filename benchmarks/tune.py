@@ -20,8 +20,8 @@ import numpy as np
 import tyro
 
 from comparison.files import write_whole
-from comparison.methods import Method
 from comparison.markdown import markdown
+from comparison.methods import Method
 from comparison.options import at_least_one, different
 from comparison.pool import execute_all, report
 from comparison.run import Run, task_setting

@@ -12,7 +12,7 @@ from PIL import Image
 
 import results_page
 from comparison import study
-from comparison.robot_tables import tables
+from comparison.tables import tables
 from torchrl_sym.recipes import RunFolder
 
 ROOT = Path(__file__).parents[1]

@@ -22,7 +22,8 @@ def corrected(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
         runs: rows of `runs.csv`, with the commits that trained each run, separated by spaces.
     """
     run = ["task", "method", "seed"]
-    old = runs["revision"].fillna("").str.split().map(lambda revisions: not RETURNS_OF_FALLS.isdisjoint(revisions))
+    commits = runs["revision"].fillna("").str.split()
+    old = ~commits.map(RETURNS_OF_FALLS.isdisjoint).astype(bool)
     concerned = pd.MultiIndex.from_frame(curves[run]).isin(pd.MultiIndex.from_frame(runs.loc[old, run]))
     wrong = concerned & (curves["stage"] > 0) & (curves["iteration"] <= FIRST_EPISODE)
     return curves.assign(**{"return": curves["return"].mask(wrong)})

@@ -107,14 +107,11 @@ class Claim:
 
     def applies(self, on: Evaluated) -> bool:
         """Whether it can be judged, or could be had seeds of its methods been evaluated."""
-        if not set(self.methods) <= set(on.task):
+        if not (set(self.methods) <= set(on.task) and self.needs(on)):
             return False
-        if self.figure is None and on.what not in (None, *on.task.evaluations[:1]):
-            return False  # training is the same for all evaluations
-        if self.missing(on):
-            return True
-        figures = (on.seeds(on[name], self.figure or "return") for name in self.methods)
-        return all(figures) and bool(self.needs(on))
+        if self.figure is None:
+            return on.what in (None, *on.task.evaluations[:1])  # training is the same for all evaluations
+        return bool(self.missing(on)) or all(on.seeds(on[name], self.figure) for name in self.methods)
 
     def missing(self, on: Evaluated) -> list[str]:
         """Methods of which no seed was evaluated."""

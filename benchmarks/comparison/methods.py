@@ -27,6 +27,10 @@ class Base:
     changes: dict[str, Any]
 
 
+def _network(kind: str) -> dict[str, Any]:
+    return {"augmentation": "none", "network": kind}
+
+
 BASES = {
     "ppo": Base("PPO", "ppo", {"augmentation": "none"}),
     "aug": Base("PPO + aug.", "aug", {"augmentation": "all"}),
@@ -45,8 +49,8 @@ BASES = {
             "learning_rate": 1e-2,
         },
     ),
-    "equivariant": Base("equivariant PPO", "equivariant", {"augmentation": "none", "network": "equivariant"}),
-    "relaxed": Base("relaxed PPO", "relaxed", {"augmentation": "none", "network": "relaxed"}),
+    "equivariant": Base("equivariant PPO", "equivariant", _network("equivariant")),
+    "relaxed": Base("relaxed PPO", "relaxed", _network("relaxed")),
 }
 
 METHOD_FIELDS = {"augmentation", "mirror_coeff", "weight_scale", "network", "initialization", "seed"}
@@ -85,8 +89,8 @@ class Method:
             kind, value = _part(part)
             if value is None:
                 raise ValueError(
-                    f"expected a method made of {list(BASES)}, loss-W and init-S with positive numbers, and "
-                    f"symmetric-init, joined by +, got {part!r} in {name!r}"
+                    f"expected a method made of {list(BASES)}, loss-W and init-S with positive numbers, "
+                    f"and symmetric-init, joined by +, got {part!r} in {name!r}"
                 )
             if kind in found:
                 raise ValueError(f"expected at most one {kind} in a method, got two in {name!r}")

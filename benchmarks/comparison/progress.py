@@ -1,8 +1,8 @@
 """How far a training has come, and when: from the curve of one seed.
 
-What is measured is the training return. Where there is a curriculum, returns fall as tasks get harder: there
-it is the level times the success rate, which is zero before the last phase and the last task of the
-curriculum, and ends where training leaves it for the last level alone.
+What is measured is the training return. Where there is a curriculum, in which returns fall as tasks get
+harder, it is the level times the success rate: zero before the last phase and the last task of the
+curriculum, and not continued once training leaves it for the last level alone.
 """
 
 from __future__ import annotations

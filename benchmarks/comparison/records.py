@@ -111,7 +111,8 @@ class EarlierResults:
         stages = self.about.get("methods", {}).get(run.task, {}).get(run.method)
         episodes = self.about.get("episodes")
         evaluations = {row["what"] for row in rows if "what" in row}
-        same = _without_seed(completed(stages or [])) == _without_seed(asked["stages"]) and episodes == [run.episodes]
+        same = _without_seed(completed(stages or [])) == _without_seed(asked["stages"])
+        same = same and episodes == [run.episodes]
         if not same or evaluations - asked["evaluations"].keys():
             raise ValueError(
                 f"expected {self.folder} to hold {run} as it is asked for now, got other settings "

@@ -194,7 +194,7 @@ class MethodResults:
         return values.max(axis=1) - values.min(axis=1)
 
     def chance_variation(self, what: str | None = None, actions: str = "deterministic") -> np.ndarray:
-        """Variation of success that chance explains, at most, ``(seeds,)``; see :func:`chance_variation`."""
+        """Variation of success that chance explains, at most, ``(seeds,)``."""
         rates = self.evaluated("success", actions, what).to_numpy()
         return chance_variation(rates, min(self.task.study.about["episodes"]))
 
@@ -295,7 +295,7 @@ def read(folder: Path) -> Study:
     if not about:
         raise FileNotFoundError(f"expected results in {folder} (study.json), found none; run compare.py")
     kinds: dict[str, Any] = defaultdict(lambda: float, dict.fromkeys(TEXT, str), seed=int)
-    how = {"dtype": kinds, "na_values": ["", "nan"], "keep_default_na": False, "float_precision": "round_trip"}
+    how = {"dtype": kinds, "na_values": ["", "nan"], "keep_default_na": False}
     runs, curves = (pd.read_csv(io.StringIO(text_of(folder, name, about)), **how) for name in TABLES)
     return Study(about, runs, corrected(curves, runs))
 
