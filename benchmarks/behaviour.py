@@ -27,8 +27,8 @@ import numpy as np
 import torch
 import tyro
 
-from compare import PRESETS
-from comparison.methods import label, parts
+from comparison.experiments import PRESETS
+from comparison.methods import Method
 from comparison.options import at_least_one, different
 from comparison.records import policy_folder
 from comparison.run import environment, task_setting
@@ -103,16 +103,16 @@ def check(arguments: Arguments, study: Study) -> None:
         ValueError: names the option.
     """
     at_least_one(arguments, "episodes", "touching")
-    different("methods", arguments.methods, key=parts)
+    different("methods", arguments.methods, key=Method.parse)
     presets = [e.tasks for experiments in PRESETS.values() for e in experiments]
     known = {*ALL_TASKS, *(task for each in presets for task in each), *arguments.tasks}
-    unknown = [name for name in study.tasks if name not in known]
+    unknown = [name for name in study if name not in known]
     if unknown:
         raise ValueError(
             f"expected {arguments.name} to be results of {sorted(known)}, got {unknown}, whose modules "
             f"would be imported; if you trust them, add --tasks {' '.join(unknown)}"
         )
-    there = {method for task in study.tasks for method in study.methods(task)}
+    there = {method for task in study.values() for method in task}
     missing = [method for method in arguments.methods if method not in there]
     if missing:
         raise ValueError(f"expected --methods of {arguments.name}, {sorted(there)}, got {missing}")
@@ -137,7 +137,7 @@ def play(task: Task, checkpoint: Path, episodes: int) -> Recording:
     return Recording(task, record(env, actor, start), elements)
 
 
-def paths(recordings: dict[str, Recording]):
+def paths(recordings: dict[Method, Recording]):
     """A row per method: paths as run, and mapped back onto the first goal."""
     size = (8, 3.9 * len(recordings) + 0.4)
     figure, axes = plt.subplots(len(recordings), 2, figsize=size, layout="constrained", squeeze=False)
@@ -146,7 +146,7 @@ def paths(recordings: dict[str, Recording]):
             shown = (recording.task, recording.states, recording.elements)
             draw_paths(axis, *shown, mapped_back=mapped, headings=False)
             goal = recording.task.goal_names[0]
-            axis.set_title(f"{label(method)}, mapped back onto {goal}" if mapped else label(method))
+            axis.set_title(f"{method.label}, mapped back onto {goal}" if mapped else method.label)
         row[0].set_ylabel("y [m]")
     names = axes[0, 0].get_legend_handles_labels()
     figure.legend(*names, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
@@ -184,7 +184,7 @@ def touches(recording: Recording, body: str) -> np.ndarray:
         return counts[:, :-1] / counts[:, -1:]
 
 
-def draw_touches(shares: dict[str, np.ndarray], goals: tuple[str, ...], body: str):
+def draw_touches(shares: dict[Method, np.ndarray], goals: tuple[str, ...], body: str):
     """A panel per method: goals by limbs."""
     figure, axes = plt.subplots(
         1, len(shares), figsize=(4.6 * len(shares), 2.9), layout="constrained", squeeze=False
@@ -197,7 +197,7 @@ def draw_touches(shares: dict[str, np.ndarray], goals: tuple[str, ...], body: st
             axis.text(column, row, text, ha="center", va="center", color=shade, fontsize=9)
         axis.set_xticks(range(len(LIMBS)), LIMBS)
         axis.set_yticks(range(len(goals)), goals)
-        axis.set_title(f"{label(method)}: limbs that touch the {body}")
+        axis.set_title(f"{method.label}: limbs that touch the {body}")
     return figure
 
 
@@ -211,14 +211,14 @@ def climbed(checkpoint: Path, episodes: int, seconds: float | None) -> np.ndarra
     return np.array(rates)
 
 
-def draw_heights(rates: dict[str, np.ndarray], goals: tuple[str, ...]):
+def draw_heights(rates: dict[Method, np.ndarray], goals: tuple[str, ...]):
     """Success over the height of the box: a colour per method, dashed for backward."""
     figure, axis = plt.subplots(figsize=(5.2, 3.2), layout="constrained")
     front = np.array([goal.startswith("front") for goal in goals])
     for method, rate in rates.items():
         for name, chosen, line in (("forward", front, "o-"), ("backward", ~front, "s--")):
             values = rate[:, chosen].mean(axis=1)
-            style = {"color": color(method), "label": f"{label(method)}, {name}", "markersize": 4}
+            style = {"color": color(method), "label": f"{method.label}, {name}", "markersize": 4}
             axis.plot(BOX_HEIGHTS, values, line, **style)
     axis.set(xlabel="height of the box [m]", ylabel="success", ylim=(-0.03, 1.03))
     axis.grid(alpha=0.3)
@@ -226,7 +226,7 @@ def draw_heights(rates: dict[str, np.ndarray], goals: tuple[str, ...]):
     return figure
 
 
-def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarray:
+def frames(recordings: dict[Method, Recording], goals: tuple[int, ...]) -> np.ndarray:
     """Key frames of the first episode of some goals, a row per method and goal."""
     rows, captions = [], []
     for method, recording in recordings.items():
@@ -238,7 +238,7 @@ def frames(recordings: dict[str, Recording], goals: tuple[int, ...]) -> np.ndarr
             first = recording.elements.index(g)
             states = [recording.states[i].rows(torch.tensor([first])) for i in chosen]
             rows.append([image[0] for image in render(task, states, camera=camera)])
-            name = f"{label(method)}, {task.goal_names[g]}"
+            name = f"{method.label}, {task.goal_names[g]}"
             captions.append([f"{name}, {i * task.control_timestep:.1f} s" for i in chosen])
     return sheet(rows, captions)
 
@@ -252,9 +252,9 @@ def main(arguments: Arguments) -> None:
     check(arguments, study)
     plots = arguments.plots / arguments.name
     plots.mkdir(parents=True, exist_ok=True)
-    for name in study.tasks:
+    for name in study:
         folder = policy_folder(results, name)
-        kept = {m: folder / m for m in arguments.methods if (folder / m).exists()}
+        kept = {Method.parse(m): folder / m for m in arguments.methods if (folder / m).exists()}
         if not kept:
             print(f"{name}: none of {', '.join(arguments.methods)} is stored; choose others by --methods")
             continue

@@ -21,14 +21,15 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
 
-from comparison import study
-from comparison.methods import METHOD_FIELDS, configure, parts
+from comparison import writing
+from comparison.experiments import OWN, PRESETS, Experiment
+from comparison.methods import METHOD_FIELDS, Method
 from comparison.options import at_least_one, different
 from comparison.pool import damaged, execute_all, report
 from comparison.records import EarlierResults
@@ -36,67 +37,6 @@ from comparison.run import Run, task_setting
 from torchrl_sym.recipes import PPOConfig, RunFolder
 
 HERE = Path(__file__).parent
-
-MAIN = ("ppo", "aug", "aug-random", "loss-0.1", "loss-1", "loss-10", "aug+loss-0.1")
-SCALES = ("aug+init-0.1", "aug+init-4", "aug+loss-0.1+init-4")
-ALL = (*MAIN, "aug-naive", "aug-naive-raw", *SCALES)
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """Some methods on some tasks.
-
-    Attributes:
-        tasks: names, or `module:function`.
-        methods: see `comparison/methods.py`.
-        seeds: how many, from 0.
-        steps: environment steps; None for what the task's settings say.
-        config: changes of the configuration.
-        episodes: evaluation episodes per goal.
-    """
-
-    tasks: tuple[str, ...]
-    methods: tuple[str, ...]
-    seeds: int
-    steps: int | None = None
-    config: dict[str, Any] = field(default_factory=dict)
-    episodes: int = 500
-
-
-_OWN = Experiment(("cartpole",), ("ppo", "aug"), 5)  # what a command line changes
-_TINY = {"num_envs": 32, "horizon": 50, "epochs": 1, "minibatches": 2}
-_CARTPOLE = Experiment(("cartpole",), ALL, 10)
-_MORE_SEEDS = (
-    Experiment(("cartpole",), ("ppo", "aug", "aug+init-0.1"), 20),  # which is faster, and better?
-    Experiment(("cartpole",), ("aug+loss-0.1+init-0.1",), 10),
-)
-
-
-def _robot(task: str, seeds: int, weights: Sequence[str], others: Sequence[str]) -> tuple[Experiment, ...]:
-    """Weights of the mirror loss with all seeds, that whose first seed did best first; others with one."""
-    methods = ("ppo", "aug", "aug-random", *(f"loss-{w}" for w in weights), f"aug+loss-{weights[0]}")
-    return Experiment((task,), methods, seeds), Experiment((task,), tuple(f"loss-{w}" for w in others), 1)
-
-
-_PUSH = _robot("anymal_push", 5, ("10",), ("1", "100"))
-_CLIMB = _robot("anymal_climb", 3, ("1", "0.1"), ("10",))  # the first seeds of both came within 0.1
-_REPOSE = _robot("trifinger_repose", 3, ("10",), ("0.1", "1", "100"))
-_REPOSE_YAW = (Experiment(("repose_yaw:make_env",), ("ppo", "aug"), 3),)
-
-PRESETS: dict[str, tuple[Experiment, ...]] = {
-    "smoke": (
-        Experiment(("cartpole",), ALL, 1, 32 * 50 * 12, _TINY, 4),
-        Experiment(("cartpole",), ("ppo", "aug"), 2, 32 * 50 * 12, _TINY, 4),
-        Experiment(("anymal_push", "anymal_climb", "trifinger_repose"), ("ppo", "aug"), 1, 3200, _TINY, 4),
-    ),
-    "paper-cartpole": (_CARTPOLE,),
-    "paper-cartpole-20": (_CARTPOLE, *_MORE_SEEDS),
-    "paper-push": _PUSH,
-    "paper-climb": _CLIMB,
-    "paper-repose": _REPOSE,
-    "paper-repose-yaw": _REPOSE_YAW,
-    "paper": (_CARTPOLE, *_MORE_SEEDS, *_PUSH, *_CLIMB, *_REPOSE, *_REPOSE_YAW),
-}
 
 
 @dataclass
@@ -109,7 +49,8 @@ class Arguments:
     tasks: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TASK ...")] = None
     """Names of tasks, or module:function (cartpole)."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="METHOD ...")] = None
-    """ppo, aug, aug-random, aug-naive, aug-naive-raw, loss-W, init-S, sums of them (ppo aug)."""
+    """ppo, aug, aug-random, aug-naive, aug-naive-raw, equivariant, relaxed, loss-W, init-S, symmetric-init,
+    sums of them (ppo aug)."""
     seeds: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Seeds per method, from 0 (5): with more of them later, the first are not trained again."""
     steps: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
@@ -161,7 +102,7 @@ def main(arguments: Arguments) -> int:
     if earlier and len(known) == len(runs):  # nor where nothing is new
         kept = (*about, "command", "collected_at")
         about |= {key: earlier.about[key] for key in kept if key in earlier.about}
-    study.write(folder, runs, failed, about, earlier=earlier)
+    writing.write(folder, runs, failed, about, earlier=earlier)
     for path in plot.draw_all(folder, arguments.plots / name):
         print(f"wrote {path}")
     return 1 if failed else 0
@@ -175,7 +116,8 @@ def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
             for task in experiment.tasks:
                 setting = task_setting(task)
                 for method in experiment.methods:
-                    changed = configure(method, setting, seed, experiment.steps, **experiment.config)
+                    asked = Method.parse(method)
+                    changed = asked.configure(setting, seed, experiment.steps, **experiment.config)
                     where = folder / task.replace(":", ".") / method / f"seed_{seed}"
                     more = (experiment.episodes, arguments.threads or 1)
                     runs[where] = Run(task, method, seed, changed, where, *more)
@@ -218,9 +160,9 @@ def chosen(arguments: Arguments) -> Sequence[Experiment]:
     if "config" in given:
         different("config", given["config"], key=lambda text: text.partition("=")[0])
         given["config"] = dict(parse(text) for text in given["config"])
-    experiment = dataclasses.replace(_OWN, **given)
+    experiment = dataclasses.replace(OWN, **given)
     different("tasks", experiment.tasks)
-    different("methods", experiment.methods, key=parts)
+    different("methods", experiment.methods, key=Method.parse)
     return [experiment]
 
 

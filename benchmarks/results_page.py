@@ -12,12 +12,20 @@ from pathlib import Path
 
 import tyro
 
-from comparison import claims, robot_claims
+from comparison import claims
 from comparison.files import write_whole
+from comparison.judging import Evaluated
+from comparison.markdown import markdown
 from comparison.reruns import marks
-from comparison.robot_tables import has_split, success_row, success_tables, throughput_table
 from comparison.study import Study, read
-from comparison.tables import efficiency_table, footnotes, markdown, table_1
+from comparison.tables import (
+    efficiency_table,
+    footnotes,
+    success_row,
+    success_tables,
+    table_1,
+    throughput_table,
+)
 
 HERE = Path(__file__).parent
 STUDY = "paper-cartpole-20"
@@ -98,9 +106,8 @@ class Arguments:
 
 def page(study: Study, tuning: str, quickstart: str, robots: dict[str, Study]) -> str:
     """docs/results.md: claims, Table I, figures, efficiency, tuning, fresh seeds; then the robots."""
-    about = study.about
+    about, task = study.about, study["cartpole"]
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
-    hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
     figures = "\n".join(
         f"![{name}](../benchmarks/plots/{STUDY}/{name}.png)\n\n{prose(f'*{caption}*')}\n"
         for name, caption in CAPTIONS.items()
@@ -108,16 +115,16 @@ def page(study: Study, tuning: str, quickstart: str, robots: dict[str, Study]) -
     made = prose(f"""Made by `python benchmarks/results_page.py` from
         [benchmarks/results](../benchmarks/results); a test compares. The runs: `{command(STUDY)}` at
         {", ".join(about["revisions"])} (+: with changes on top; {versions}; {about["machine"]},
-        {about["workers"]} runs at a time, threads each: {about.get("threads", 1)}; {len(study.curves)}
-        runs, {hours:.1f} hours of one core in training; which run is of which commit is in `runs.csv`).
-        Draw again: `python benchmarks/plot.py {STUDY}`.""")
+        {about["workers"]} runs at a time, threads each: {about.get("threads", 1)}; {study.trained}
+        runs, {study.hours:.1f} hours of one core in training; which run is of which commit is in
+        `runs.csv`). Draw again: `python benchmarks/plot.py {STUDY}`.""")
     rule = prose("""Two methods are compared by the difference of their interquartile means
         over seeds, with its 95 % bootstrap interval in brackets. *Confirmed*: the interval lies on the
         side that the paper claims. *Different*: on the other side. *Not confirmed*: it contains zero.
         That something gains nothing is confirmed if the whole interval lies below a margin. Counts of
         seeds are compared by Fisher's exact test, 2.5 % on either side. The paper's returns are not
         comparable in size: it gives neither velocity limit nor episode length.""")
-    outdated = any(marks(study, "cartpole", method) for method in study.methods("cartpole"))
+    outdated = any(map(marks, task.values()))
     if outdated:
         rule += "\n\n" + prose(WAITING)
     tuned = """Every family of methods tried the same changes of the same settings with
@@ -141,10 +148,10 @@ def page(study: Study, tuning: str, quickstart: str, robots: dict[str, Study]) -
 
 {rule}
 
-{claims.table(study)}
+{claims.table(task)}
 ## Table I
 
-{table_1(study, "cartpole")}
+{table_1(task)}
 ## Figures
 
 Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
@@ -156,7 +163,7 @@ Lines are interquartile means over seeds, bands their 95 % bootstrap intervals.
 
 ## Efficiency
 
-{efficiency_table(study, "cartpole")}
+{efficiency_table(task)}
 ## How the methods were tuned
 
 {tuned}
@@ -181,16 +188,16 @@ def fresh_seeds(table: str) -> str:
 
 def robot_section(name: str, study: Study) -> str:
     """What the paper claims of a robot task and what was found, with figures and costs."""
-    (task, title), about = ROBOTS[name], study.about
-    hours = sum(float(c["seconds"][-1]) for c in study.curves.values()) / 3600
-    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-    made = prose(f"""`{command(name)}` at {", ".join(about["revisions"])}: {len(study.curves)} runs of
-        {steps:.1f} million steps, {hours:.1f} hours of one core; {about["machine"]}. Draw again:
-        `python benchmarks/plot.py {name}` and `python benchmarks/behaviour.py {name}`. The settings were
-        found with augmentation and are used for all methods; none was tuned by itself.""")
-    results = robot_claims.Results(study, task, study.evaluations(task)[0])
-    if results.losses(1):
-        close = len(results.losses()) > 1
+    (of, title), about = ROBOTS[name], study.about
+    task = study[of]
+    made = prose(f"""`{command(name)}` at {", ".join(about["revisions"])}: {study.trained} runs of
+        {study.million_steps:.1f} million steps, {study.hours:.1f} hours of one core;
+        {about["machine"]}. Draw again: `python benchmarks/plot.py {name}` and
+        `python benchmarks/behaviour.py {name}`. The settings were found with augmentation and are used for
+        all methods; none was tuned by itself.""")
+    losses = Evaluated(task).losses
+    if losses(1):
+        close = len(losses()) > 1
         made += "\n\n" + prose(f"""Of the weights of the mirror loss, the one whose first seed had the
             highest return with mean actions, in the mean of all evaluations, got all
             seeds{", and so did one that came close" * close}.""")
@@ -201,13 +208,13 @@ def robot_section(name: str, study: Study) -> str:
         differ, one in ten is *confirmed* by chance, with five one in thirty; a single seed has no interval
         and decides nothing. Seconds are those of runs at different times, on a machine whose speed is not
         always the same: steps compare methods, seconds say how long to wait.""")
-    if any(marks(study, task, method) for method in study.methods(task)):
+    if any(map(marks, task.values())):
         made += "\n\n" + prose(WAITING)
     if name in REMARKS:
         made += "\n\n" + prose(REMARKS[name])
     judged = "\n".join(
-        (f"### Claims: {what}\n\n" if what != "task" else "") + robot_claims.table(study, task, what)
-        for what in study.evaluations(task)
+        (f"### Claims: {what}\n\n" if what != "task" else "") + claims.table(task, what)
+        for what in task.evaluations
     )
     return f"""
 ## {title}
@@ -215,10 +222,10 @@ def robot_section(name: str, study: Study) -> str:
 {made}
 
 {judged}
-{success_tables(study, task)}
+{success_tables(task)}
 {robot_figures(name)}
-{efficiency_table(study, task)}
-{throughput_table(study, task) if has_split(study, task) else ""}"""
+{efficiency_table(task)}
+{throughput_table(task) if task.has_split else ""}"""
 
 
 def command(name: str) -> str:
@@ -243,32 +250,32 @@ def robot_figures(name: str) -> str:
 
 def readme_block(study: Study) -> str:
     """The README's table, and what it shows."""
-    plain, copies = (claims.variations(study, m) for m in ("ppo", "aug"))
+    shown = [study["cartpole"][name] for name in README_METHODS]
+    plain, copies = (study["cartpole"][name].variation() for name in ("ppo", "aug"))
     one_sided = f"{(plain > claims.SWING).sum()} of {len(plain)}"
-    steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-    seeds = " to ".join(map(str, sorted({len(study.seeds("cartpole", m)) for m in README_METHODS})))
+    seeds = " to ".join(map(str, sorted({len(results.seeds) for results in shown})))
     text = prose(f"""The two sides differ by more than {claims.SWING:g} in {one_sided} seeds of
         plain PPO: from one of them it swings the pole up by a detour. With symmetric copies the worst of
         {len(copies)} seeds differs by {copies.max():.3f}. Every claim of
         the paper with evidence and verdict, also those that do not hold here:
         [results](docs/results.md).""")
-    if any(marks(study, "cartpole", method) for method in README_METHODS):
+    if any(map(marks, shown)):
         text += "\n" + prose(SINCE_THEN)
-    head = f"After {steps:.1f} million steps, {seeds} seeds per method:"
-    return f"{head}\n\n{table_1(study, 'cartpole', README_METHODS)}\n{text}\n"
+    head = f"After {study.million_steps:.1f} million steps, {seeds} seeds per method:"
+    return f"{head}\n\n{table_1(study['cartpole'], README_METHODS)}\n{text}\n"
 
 
 def readme_robot_block(studies: dict[str, Study]) -> str:
     """What the README says of the robots: plain PPO and augmentation on every task."""
     columns = ("seeds", "success [%]", "worst goal [%]", "spread [%]")
-    rows = [["task", "method", *columns], ["---", "---", *["---:"] * len(columns)]]
+    rows = []
     for name, study in studies.items():
-        task, title = ROBOTS[name]
-        steps = max(float(c["frames"][-1]) for c in study.curves.values()) / 1e6
-        what = study.evaluations(task)[0]
-        first = f"{title}{f', {what}' * (what != 'task')}, {steps:.1f} M steps"
-        for method in ("ppo", *robot_claims.Results(study, task, what).losses(), "aug"):
-            row = success_row(study, task, method)
+        of, title = ROBOTS[name]
+        task = study[of]
+        what = task.evaluations[0]
+        first = f"{title}{f', {what}' * (what != 'task')}, {study.million_steps:.1f} M steps"
+        for results in (task["ppo"], *Evaluated(task).losses(), task["aug"]):
+            row = success_row(results)
             rows.append([first, row["method"], *(row.get(column, "-") for column in columns)])
             first = ""
     episodes = max(max(study.about["episodes"]) for study in studies.values())
@@ -279,7 +286,7 @@ def readme_robot_block(studies: dict[str, Study]) -> str:
     missing = sum(len(study.about.get("unfinished", [])) for study in studies.values())
     if missing:
         text += "\n" + prose(f"More seeds and methods are being trained: {missing} runs.")
-    return f"{markdown(rows)}{footnotes(rows)}\n{text}\n"
+    return f"{markdown(['task', 'method', *columns], rows, texts=2)}{footnotes(rows)}\n{text}\n"
 
 
 def prose(text: str) -> str:

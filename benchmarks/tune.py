@@ -7,24 +7,29 @@ same seeds; the best two get more seeds; the best mean return wins. The seeds ar
 comparison. The winners are written down in `tasks.settings` (`Setting.tuned`) by hand.
 """
 
+from __future__ import annotations
+
 import dataclasses
 import os
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 
-from comparison import study
 from comparison.files import write_whole
-from comparison.methods import configure, parts
+from comparison.markdown import markdown
+from comparison.methods import Method
 from comparison.options import at_least_one, different
 from comparison.pool import execute_all, report
 from comparison.run import Run, task_setting
-from comparison.tables import markdown
+from comparison.writing import write
 from torchrl_sym.recipes import RunFolder
+
+if TYPE_CHECKING:
+    from comparison.study import Study
 
 HERE = Path(__file__).parent
 FAMILIES = ("ppo", "aug", "loss-1", "aug-naive")
@@ -67,6 +72,8 @@ class Arguments:
 
 
 def main(arguments: Arguments) -> int:
+    from comparison.study import read  # every run's process imports this file, and has no use for pandas
+
     check(arguments)
     names = list(CANDIDATES)[: arguments.candidates]
     runs = [make_run(arguments, f, c, seed) for seed in FIRST for f in arguments.families for c in names]
@@ -77,8 +84,8 @@ def main(arguments: Arguments) -> int:
             runs += [make_run(arguments, f, c, seed) for seed in MORE for c in best]
         failed += execute_all([run for run in runs if run not in failed], arguments.workers)
     report(failed)
-    study.write(arguments.output, runs, failed, {"workers": arguments.workers}, points=10)
-    found = table(study.read(arguments.output))
+    write(arguments.output, runs, failed, {"workers": arguments.workers}, points=10)
+    found = table(read(arguments.output))
     write_whole(arguments.output / "README.md", found)
     print(found)
     return 1 if failed else 0
@@ -94,14 +101,14 @@ def check(arguments: Arguments) -> None:
     if arguments.candidates > len(CANDIDATES):
         most = f"at most {len(CANDIDATES)}, which there are"
         raise ValueError(f"expected --candidates of {most}, got {arguments.candidates}")
-    different("families", arguments.families, key=parts)
+    different("families", arguments.families, key=Method.parse)
 
 
 def make_run(arguments: Arguments, family: str, candidate: str, seed: int) -> Run:
     """One run of a candidate, from the task's settings whatever has been tuned already."""
     changes = CANDIDATES[candidate]
     setting = dataclasses.replace(task_setting(arguments.task), tuned={})
-    setting = configure(family, setting, seed, arguments.steps, **changes)
+    setting = Method.parse(family).configure(setting, seed, arguments.steps, **changes)
     where = arguments.folder / arguments.task / family / candidate.replace(" ", "_") / f"seed_{seed}"
     return Run(arguments.task, f"{family}: {candidate}", seed, setting, where, arguments.episodes)
 
@@ -114,33 +121,27 @@ def score(runs: list[Run], family: str, candidate: str) -> float:
     return float(np.mean([np.mean(values) if values else -np.inf for values in each]))
 
 
-def table(results: study.Study) -> str:
+def table(study: Study) -> str:
     """Candidates x families: mean evaluated return, and how many seeds it is the mean of."""
-    (task,) = results.tasks
-    methods = [method.split(": ") for method in results.methods(task)]
-    families = list(dict.fromkeys(f for f, _ in methods))
-    candidates = list(dict.fromkeys(c for _, c in methods))
-    means = {
-        (f, c): results.goal_returns(task, f"{f}: {c}")[1].mean(axis=1)
-        for f in families
-        for c in candidates
+    ((task, results),) = study.items()
+    returns = {tuple(name.split(": ")): each.returns() for name, each in results.items()}
+    families, candidates = (list(dict.fromkeys(names)) for names in zip(*returns, strict=True))
+    most = {f: max(len(returns[f, c]) for c in candidates) for f in families}
+    best = {
+        f: max(returns[f, c].mean() for c in candidates if len(returns[f, c]) == most[f]) for f in families
     }
-    lines = [["candidate", *families], ["---", *["---:"] * len(families)]]
+    rows = []
     for c in candidates:
-        lines.append([c])
+        rows.append([c])
         for f in families:
-            seeds = len(means[f, c])
-            most = max(len(means[f, other]) for other in candidates)
-            rivals = [means[f, o].mean() for o in candidates if len(means[f, o]) == most]
-            text = f"{means[f, c].mean():.3f} ({seeds})"
-            lines[-1].append(f"**{text}**" if seeds == most and means[f, c].mean() == max(rivals) else text)
-    commits = ", ".join(results.about["revisions"])
-    text = f"Made by `{results.about['command']}` ({commits}): mean evaluated return of {task} and, in "
-    text += (
-        f"brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the best {KEPT} of "
-    )
-    text += f"a family got {len(MORE)} more. Bold: the winner among those.\n\n"
-    return text + markdown(lines)
+            own = returns[f, c]
+            mark = "**" * (len(own) == most[f] and own.mean() == best[f])
+            rows[-1].append(f"{mark}{own.mean():.3f} ({len(own)}){mark}")
+    commits = ", ".join(study.about["revisions"])
+    text = f"Made by `{study.about['command']}` ({commits}): mean evaluated return of {task} and, in "
+    text += f"brackets, the number of\nseeds; the first {len(FIRST)} are the same for all, the best {KEPT} "
+    text += f"of a family got {len(MORE)} more. Bold: the winner among those.\n\n"
+    return text + markdown(["candidate", *families], rows)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,9 @@ import tyro
 import compare as compare_script
 import tasks
 import tune
-from comparison import claims, methods, study
+from comparison import study
 from comparison.files import write_json
+from comparison.methods import Method
 from comparison.reruns import marks
 from comparison.run import Run
 from tasks.settings import SETTINGS
@@ -135,7 +136,7 @@ def test_a_killed_comparison_goes_on_and_ends_alike(tmp_path):
     asked = compare_script.Arguments(methods=("ppo", "loss-1"), **changes, **places)
     assert compare_script.main(asked) == 0
     part = study.read(tmp_path / "results" / "custom")
-    assert part.methods("cartpole") == ["ppo"] and part.about["unfinished"] == ["cartpole loss-1 0"]
+    assert list(part["cartpole"]) == ["ppo"] and part.about["unfinished"] == ["cartpole loss-1 0"]
     assert compare_script.main(dataclasses.replace(asked, methods=("loss-1",))) == 1
 
 
@@ -155,8 +156,8 @@ def test_results_are_extended_where_the_runs_are_gone(tmp_path):
     for name in ("runs.csv", "curves.csv"):
         assert (results / name).read_text().startswith(before[name])
     found = study.read(results)
-    assert found.seeds("cartpole", "ppo") == [0, 1]
-    assert {len(curve["frames"]) for curve in found.curves_of("cartpole", "ppo").values()} == {2}
+    assert found["cartpole"]["ppo"].seeds == [0, 1]
+    assert {len(curve) for curve in found["cartpole"]["ppo"].curves.values()} == {2}
     assert len(found.about["revisions"]) == 1 and " / " not in found.about["machine"]
     assert found.about["command"].endswith("--seeds 2 --extend"), "what was given"
     # Neither mixed with runs of other settings, nor overwritten.
@@ -173,12 +174,12 @@ def test_results_are_extended_where_the_runs_are_gone(tmp_path):
 def test_stored_results_are_what_their_preset_trains(preset):
     stored = study.read(RESULTS / preset)
     runs = compare_script.make_runs(compare_script.Arguments(preset=preset), Path("none"))
-    missing = [str(run) for run in runs if run.seed not in stored.seeds(run.task, run.method)]
+    missing = [str(run) for run in runs if run.seed not in stored[run.task][run.method].seeds]
     assert missing == stored.about["unfinished"]
     assert len(missing) < len(runs)
     # Rows that are trained by other rules today say so; the others with these very settings.
     for run in runs:
-        if marks(stored, run.task, run.method):
+        if marks(stored[run.task][run.method]):
             continue
         for before, now in zip(
             stored.about["methods"][run.task][run.method], run.request()["stages"], strict=True
@@ -340,15 +341,15 @@ def test_the_methods_use_what_the_search_found():
     for column, family in enumerate(tune.FAMILIES, start=2):
         rows = [line.split("|") for line in (stored / "README.md").read_text().splitlines() if "**" in line]
         (winner,) = [row[1].strip() for row in rows if "**" in row[column]]
-        winners[methods.family(family)] = tune.CANDIDATES[winner]
+        winners[Method.parse(family).family] = tune.CANDIDATES[winner]
     assert SETTINGS["cartpole"].tuned == winners
 
 
 def test_augmentation_is_twenty_times_as_symmetric_and_no_worse():
     found = study.read(ROOT / "benchmarks" / "results" / "paper-cartpole-20")
-    plain, copies = (claims.variations(found, method) for method in ("ppo", "aug"))
-    assert plain.mean() > 20 * copies.mean()
-    assert claims.returns(found, "aug").mean() >= claims.returns(found, "ppo").mean()
+    plain, copies = (found["cartpole"][method] for method in ("ppo", "aug"))
+    assert plain.variation().mean() > 20 * copies.variation().mean()
+    assert copies.returns().mean() >= plain.returns().mean()
 
 
 def test_a_second_comparison_in_the_same_folder_is_refused(tmp_path):

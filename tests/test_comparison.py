@@ -1,67 +1,126 @@
 """The parts of benchmarks/compare.py: methods, statistics, tables, verdicts."""
 
 import dataclasses
+import json
 import math
 import shutil
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import ExplorationType
 
-from comparison import claims, methods, tables, verdicts
+from comparison import claims, tables, verdicts
 from comparison import run as run_module
 from comparison.files import write_json
 from comparison.intervals import Estimate, band, difference, estimate, iqm
+from comparison.judging import Evaluated
+from comparison.methods import METHOD_FIELDS, Method
+from comparison.progress import crossing
 from comparison.records import EarlierResults
 from comparison.run import Run, environment, read_curve, task_setting
-from comparison.study import Study, read, write
+from comparison.study import Study, read
+from comparison.writing import write
 from tasks.anymal_push import AnymalPush
 from tasks.settings import SETTINGS
 from torchrl_sym.recipes import RunFolder, load_actor, train
 
 
-def test_a_method_is_a_sum_of_parts():
-    assert methods.parts("ppo") == ("ppo", 0.0, 1.0)
-    assert methods.parts("loss-0.1") == ("ppo", 0.1, 1.0)
-    assert methods.parts("aug+loss-0.1+init-4") == ("aug", 0.1, 4.0)
-    assert methods.parts("aug-naive-raw") == ("aug-naive-raw", 0.0, 1.0)
-    names = ["ppo", "loss-1", "aug", "aug-random", "aug+loss-1", "aug-naive", "aug-naive-raw"]
-    families = ["ppo", "loss", "aug", "aug", "aug", "aug-naive", "aug-naive"]
-    assert [methods.family(name) for name in names] == families
-    assert len({methods.label(name) for name in names}) == len(names)
+@pytest.mark.parametrize(
+    ("name", "method", "family", "label"),
+    [
+        ("ppo", Method(), "ppo", "PPO"),
+        ("loss-0.1", Method("ppo", 0.1), "loss", "PPO + loss-0.1"),
+        ("aug-random", Method("aug-random"), "aug", "PPO + aug. (random)"),
+        ("aug-naive-raw", Method("aug-naive-raw"), "aug-naive", "naive aug., unprotected"),
+        ("aug+loss-0.1+init-4", Method("aug", 0.1, 4.0), "aug", "PPO + aug. + loss-0.1, init-4"),
+        ("equivariant", Method("equivariant"), "equivariant", "equivariant PPO"),
+        ("relaxed+loss-1", Method("relaxed", 1.0), "relaxed", "relaxed PPO + loss-1"),
+        ("ppo+symmetric-init", Method("ppo", 0.0, 1.0, "symmetric"), "ppo", "PPO, symmetric init"),
+        (
+            "aug+symmetric-init+init-4",
+            Method("aug", 0.0, 4.0, "symmetric"),
+            "aug",
+            "PPO + aug., symmetric init-4",
+        ),
+    ],
+)
+def test_a_method_is_a_sum_of_parts(name, method, family, label):
+    parsed = Method.parse(name)
+    assert (parsed, parsed.name, parsed.family, parsed.label) == (method, name, family, label)
+    turned = Method.parse("+".join(reversed(name.split("+"))))
+    assert turned == method and hash(turned) == hash(method), "in any order"
 
 
 @pytest.mark.parametrize(
-    "name", ["augment", "loss-", "loss-x", "loss-inf", "init-0", "init-nan", "aug+", "init", "loss--1"]
+    "name",
+    [
+        "augment",
+        "loss-",
+        "loss-x",
+        "loss-inf",
+        "init-0",
+        "init-nan",
+        "aug+",
+        "init",
+        "loss--1",
+        "init-init",
+    ],
 )
 def test_an_unknown_part_is_named(name):
     with pytest.raises(ValueError, match="expected a method made of"):
-        methods.parts(name)
+        Method.parse(name)
 
 
-@pytest.mark.parametrize("name", ["aug+ppo", "loss-1+loss-2", "aug+init-2+init-2"])
+@pytest.mark.parametrize(
+    "name",
+    ["aug+ppo", "loss-1+loss-2", "aug+init-2+init-2", "aug+equivariant", "symmetric-init+symmetric-init"],
+)
 def test_a_method_has_one_part_of_a_kind(name):
     with pytest.raises(ValueError, match="expected at most one"):
-        methods.parts(name)
+        Method.parse(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "complaint"),
+    [
+        ("equivariant+symmetric-init", "no symmetric-init beside equivariant"),
+        ("relaxed+init-4+symmetric-init", "no symmetric-init beside relaxed"),
+        ("equivariant+loss-1", "no mirror loss beside equivariant, where it is always zero"),
+    ],
+)
+def test_a_part_without_effect_is_refused(name, complaint):
+    with pytest.raises(ValueError, match=f"expected {complaint}"):
+        Method.parse(name)
 
 
 def test_methods_change_the_settings():
-    config = methods.configure("aug-naive-raw", SETTINGS["cartpole"], seed=3).config
+    config = Method.parse("aug-naive-raw").configure(SETTINGS["cartpole"], seed=3).config
     assert (config.augmentation, config.max_log_ratio, config.max_std) == ("naive", math.inf, math.inf)
     assert config.seed == 3
-    config = methods.configure("loss-10", SETTINGS["cartpole"], 0, num_envs=64).config
+    config = Method.parse("loss-10").configure(SETTINGS["cartpole"], 0, num_envs=64).config
     assert (config.augmentation, config.mirror_coeff, config.num_envs) == ("none", 10.0, 64)
-    scaled = methods.configure("aug+init-4", SETTINGS["cartpole"], 0).config
+    scaled = Method.parse("aug+init-4").configure(SETTINGS["cartpole"], 0).config
     assert (scaled.augmentation, scaled.weight_scale) == ("all", 4.0)
+
+
+def test_networks_and_initial_weights_are_changes_of_the_configuration():
+    ordinary = {"augmentation": "all", "mirror_coeff": 0.0, "weight_scale": 4.0}
+    assert Method.parse("aug+init-4").changes == ordinary, "nothing that is the default"
+    assert Method.parse("aug+symmetric-init+init-4").changes == ordinary | {"initialization": "symmetric"}
+    for network in ("equivariant", "relaxed"):
+        changes = Method.parse(network).changes
+        assert (changes["network"], changes["augmentation"]) == (network, "none")
+        assert changes.keys() <= METHOD_FIELDS, "not for --config to change"
 
 
 def test_all_members_of_a_family_share_what_was_tuned():
     setting = dataclasses.replace(SETTINGS["cartpole"], tuned={"aug": {"gamma": 0.5}})
     gamma = {
-        name: methods.configure(name, setting, 0).config.gamma
+        name: Method.parse(name).configure(setting, 0).config.gamma
         for name in ("aug", "aug-random", "aug+loss-1", "ppo", "aug-naive")
     }
     default = SETTINGS["cartpole"].config.gamma
@@ -71,7 +130,7 @@ def test_all_members_of_a_family_share_what_was_tuned():
 
 def test_steps_shorten_all_stages_alike():
     setting = SETTINGS["anymal_push"]
-    half = methods.configure("ppo", setting, 0, steps=setting.frames // 2)
+    half = Method.parse("ppo").configure(setting, 0, steps=setting.frames // 2)
     whole = [stage.config.iterations for stage in setting.stages]
     assert [stage.config.iterations for stage in half.stages] == [count // 2 for count in whole]
     assert half.frames == setting.frames // 2
@@ -110,56 +169,60 @@ def make_study(returns, curves, task="cartpole", seconds=1.0, columns=None):
         for s, row in enumerate(values)
         for goal, value in zip(goals, row, strict=True)
     ]
-    found = {}
+    tables = []
     for m, values in curves.items():
         for s, row in enumerate(np.asarray(values, dtype=float)):
             steps = np.arange(1, len(row) + 1) * 1e5
-            found[task, m, s] = {"frames": steps, "seconds": steps * 1e-5 * seconds, "return": row}
+            own = {"frames": steps, "seconds": steps * 1e-5 * seconds, "return": row}
             for column in ("mirror_loss", "log_prob", "log_prob_copies"):
-                value = (columns or {}).get((m, column), 1.0)
-                found[task, m, s][column] = np.full(len(row), value)
-    return Study({"methods": {task: dict.fromkeys(returns, None)}}, rows, found)
+                own[column] = (columns or {}).get((m, column), 1.0)
+            tables.append(pd.DataFrame(own).assign(task=task, method=m, seed=s))
+    return Study({"methods": {task: dict.fromkeys(returns)}}, pd.DataFrame(rows), pd.concat(tables))
+
+
+def changed(study, method, seed, change):
+    """A study with other rows of one curve."""
+    mine = (study.curves["method"] == method) & (study.curves["seed"] == seed)
+    parts = [study.curves[~mine], change(study.curves[mine])]
+    return Study(study.about, study.runs, pd.concat(parts).sort_values(["method", "seed"], kind="stable"))
 
 
 def test_efficiency_by_hand():
     rising = [-10.0, -8.0, -6.0, -4.0, -2.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     study = make_study({"ppo": [[0, 0]] * 2}, {"ppo": [rising, [-10.0] * 10]}, seconds=2.0)
-    assert tables.threshold(study, "cartpole") == pytest.approx(0.1 * -10 + 0.9 * -5)
-    reached = tables.steps_to(study, "cartpole", "ppo", -1.0)  # the mean of five points reaches -0.4 at 9
-    assert reached.tolist() == [0.9, math.inf]
-    own = tables.steps_to_own(study, "cartpole", "ppo")  # -0.6, from -6 to 0; and at once
-    assert own.tolist() == [0.9, 0.5]
-    assert tables.seconds_per_step(study, "cartpole", "ppo") == pytest.approx(2e-5)
-    assert "| PPO | 1 of 2 | - | - | 50,000 |" in tables.efficiency_table(study, "cartpole")
-    slow = study.curves["cartpole", "ppo", 1]
-    slow["return"], slow["seconds"] = np.array(rising), 3 * slow["seconds"]  # 6 s a point
-    assert tables.crossings(study, "cartpole", "ppo", -1.0).tolist() == [[0.9, 18.0], [0.9, 54.0]]
+    task, results = study["cartpole"], study["cartpole"]["ppo"]
+    assert task.threshold == pytest.approx(0.1 * -10 + 0.9 * -5)
+    found = [crossing(curve, -1.0)[0] for curve in results.progress.values()]
+    assert found == [0.9, math.inf], "the mean of five points reaches -0.4 at 9"
+    assert results.own_steps.tolist() == [0.9, 0.5], "-0.6, from -6 to 0; and at once"
+    assert results.seconds_per_step == pytest.approx(2e-5)
+    assert "| PPO | 1 of 2 | - | - | 50,000 |" in tables.efficiency_table(task)
+    slow = changed(study, "ppo", 1, lambda c: c.assign(**{"return": rising, "seconds": 3 * c["seconds"]}))
+    task, results = slow["cartpole"], slow["cartpole"]["ppo"]  # 6 s a point
+    assert task.threshold == pytest.approx(-1.0)
+    assert results.crossings.tolist() == [[0.9, 18.0], [0.9, 54.0]]
     # Of steps and of seconds each the median; seconds per step are that of all intervals together.
-    assert "| PPO | 2 of 2 | 0.90 | 36 | 25,000 |" in tables.efficiency_table(study, "cartpole")
-    study.curves["cartpole", "ppo", 1] = {name: values[:3] for name, values in slow.items()}
-    reached = tables.crossings(study, "cartpole", "ppo", -1.0).tolist()
-    assert reached == [[0.9, 18.0], [math.inf, math.inf]], "too short to be smoothed"
+    assert "| PPO | 2 of 2 | 0.90 | 36 | 25,000 |" in tables.efficiency_table(task)
+    short = changed(slow, "ppo", 1, lambda c: c.head(3))["cartpole"]["ppo"]
+    assert [crossing(curve, -1.0) for curve in short.progress.values()][1] == (math.inf, math.inf)
 
 
 def test_table_1_by_hand():
     study = make_study({"ppo": [[-1.0, -3.0], [-2.0, -2.5]]}, {"ppo": [[-1.0] * 3] * 2})
-    assert tables.variation(study.goal_returns("cartpole", "ppo")[1]).tolist() == [2.0, 0.5]
-    row = tables.table_1(study, "cartpole").splitlines()[2]
+    assert study["cartpole"]["ppo"].variation().tolist() == [2.0, 0.5]
+    row = tables.table_1(study["cartpole"]).splitlines()[2]
     assert row == "| PPO | 2 | -2.125 (-2.250 to -2.000) | 1.250 (0.500 to 2.000) | 2.000 | 1 |"
 
 
 def test_curves_of_different_lengths_are_aligned_by_steps():
     study = make_study({"ppo": [[0, 0]] * 3}, {"ppo": [[1.0, 2.0, 3.0, 4.0]] * 3})
-    short = study.curves["cartpole", "ppo", 1]
-    for column, values in short.items():  # diverged in the middle, with a row off the others' grid
-        short[column] = values[:2]
-    short["frames"] = np.array([1e5, 2.5e5])
-    lost = study.curves["cartpole", "ppo", 2]
-    lost["return"] = np.full(4, math.nan)
-    steps, values = study.curve("cartpole", "ppo", "return")
-    np.testing.assert_allclose(steps, [0.1, 0.2, 0.3, 0.4])
-    assert values.tolist() == [[1, 2, 3, 4], [1, 1, 2, 2]]
-    assert len(tables.steps_to(study, "cartpole", "ppo", 0.0)) == 3
+    # Diverged in the middle, with a row off the others' grid; and before it had a return.
+    study = changed(study, "ppo", 1, lambda c: c.head(2).assign(frames=[1e5, 2.5e5]))
+    study = changed(study, "ppo", 2, lambda c: c.assign(**{"return": math.nan}))
+    curve = study["cartpole"]["ppo"].curve("return")
+    np.testing.assert_allclose(curve.index, [0.1, 0.2, 0.3, 0.4])
+    assert curve.to_dict("list") == {0: [1, 2, 3, 4], 1: [1, 1, 2, 2]}
+    assert len(study["cartpole"]["ppo"].crossings) == 3
 
 
 def test_verdicts_follow_the_interval():
@@ -179,8 +242,8 @@ def test_verdicts_follow_the_interval():
     assert verdicts.more((5, 10), (0, 10)) == "confirmed", "p = 0.016"
     assert verdicts.more((4, 10), (0, 10)) == "not confirmed", "p = 0.043, on one side"
     assert verdicts.more((3, 4), (1, 4)) == "not confirmed (4 seeds)"
-    assert verdicts.joined(return_="a", speed="a") == "a"
-    assert verdicts.joined(than_PPO="a", speed="b") == "than PPO: a, speed: b"
+    assert verdicts.joined({"return": "a", "speed": "a"}) == "a"
+    assert verdicts.joined({"than PPO": "a", "speed": "b"}) == "than PPO: a, speed: b"
 
 
 # Per method: evaluated returns of both sides, the point at which training gets there, symmetry loss.
@@ -227,14 +290,22 @@ def world(methods, seeds=10):
     return make_study(returns, curves, columns=columns)
 
 
-@pytest.mark.parametrize("number", range(len(claims.CLAIMS)), ids=lambda n: claims.CLAIMS[n].judge.__name__)
-def test_every_verdict_turns_with_the_data(number):
-    judge = claims.CLAIMS[number].judge
-    evidence, outcome = judge(world(PAPER_IS_RIGHT))
+RIGHT, WRONG = (Evaluated(world(each)["cartpole"]) for each in (PAPER_IS_RIGHT, PAPER_IS_WRONG))
+OF_CARTPOLE = [claim for claim in claims.CLAIMS if claim.applies(RIGHT)]
+
+
+def test_all_claims_but_those_of_robots_apply_to_cartpole():
+    names = [claim.judge.__name__ for claim in claims.CLAIMS if claim not in OF_CARTPOLE]
+    assert names == ["_recovery", "_turning"]
+
+
+@pytest.mark.parametrize("claim", OF_CARTPOLE, ids=lambda claim: claim.judge.__name__)
+def test_every_verdict_turns_with_the_data(claim):
+    evidence, outcome = claim.judge(RIGHT)
     assert outcome == "confirmed", evidence
-    evidence, outcome = judge(world(PAPER_IS_WRONG))
+    evidence, outcome = claim.judge(WRONG)
     # All seeds reach the threshold there, with and without re-evaluated probabilities.
-    assert outcome == ("not confirmed" if judge.__name__ == "_naive" else "different"), evidence
+    assert outcome == ("not confirmed" if claim.judge.__name__ == "_naive" else "different"), evidence
 
 
 def test_results_survive_writing_and_reading(tmp_path):
@@ -246,17 +317,16 @@ def test_results_survive_writing_and_reading(tmp_path):
     lost = dataclasses.replace(run, seed=6, folder=tmp_path / "lost")
     write(tmp_path / "results", [run, lost], [lost], {"workers": 1})
     study = read(tmp_path / "results")
-    assert study.tasks == ["cartpole"]
-    assert study.methods("cartpole") == ["ppo"]
-    assert study.seeds("cartpole", "ppo") == [5]
+    results = study["cartpole"]["ppo"]
+    assert (list(study), list(study["cartpole"]), results.seeds) == (["cartpole"], ["ppo"], [5])
     assert study.about["failed"] == ["cartpole ppo 6"]
-    goals, values = study.goal_returns("cartpole", "ppo")
+    evaluated = results.evaluated()
     stored = [r["return"] for r in run.result()["evaluation"] if r["actions"] == "deterministic"]
-    assert goals == ["right", "left"]
-    np.testing.assert_allclose(values[0], stored, rtol=1e-5)
-    steps, losses = study.curve("cartpole", "ppo", "mirror_loss")
-    assert steps.tolist() == [32e-6, 64e-6]
-    np.testing.assert_allclose(losses[0], [row["mirror_loss"] for row in read_curve(run.folder)], rtol=1e-5)
+    assert list(evaluated) == ["right", "left"]
+    np.testing.assert_allclose(evaluated.loc[5], stored, rtol=1e-5)
+    losses = results.curve("mirror_loss")
+    assert losses.index.tolist() == [32e-6, 64e-6]
+    np.testing.assert_allclose(losses[5], [row["mirror_loss"] for row in read_curve(run.folder)], rtol=1e-5)
     # What was trained elsewhere says so, wherever it is collected.
     stored = run.result()
     other = dataclasses.replace(run, seed=7, setting=setting.replace(seed=7), folder=tmp_path / "other")
@@ -269,6 +339,17 @@ def test_results_survive_writing_and_reading(tmp_path):
     assert about["machine"] == " / ".join(sorted([here["machine"], "elsewhere"]))
     assert about["versions"] == here["versions"] | {"torch": f"0 / {torch.__version__}"}
     assert about["revisions"] == sorted([here["revision"], "r"])
+    # A field of the configuration that there was not yet had its default.
+    for name in ("request.json", "result.json"):
+        old = json.loads((run.folder / name).read_text())
+        del old["stages"][0]["config"]["tie_std"]
+        write_json(run.folder / name, old)
+    assert run.result() is not None
+    run.execute()
+    write(tmp_path / "results", [run], [], {})
+    assert "tie_std" not in read(tmp_path / "results")["cartpole"]["ppo"].stages[0]["config"], "as stored"
+    assert EarlierResults(tmp_path / "results").record(run) is not None
+    assert dataclasses.replace(run, setting=setting.replace(tie_std=True)).result() is None
     # Asked for something else, it counts as not done, and its folder is refused.
     assert dataclasses.replace(run, episodes=3).result() is None
     longer = dataclasses.replace(run, setting=setting.replace(iterations=3))
@@ -294,7 +375,7 @@ def test_the_policy_of_the_best_seed_is_kept(tmp_path):
     kept = load_actor(tmp_path / "results/policies/anymal_push/ppo", env, env.symmetry)
     best = load_actor(runs[int(np.argmax(means))].folder / "stage_0", env, env.symmetry)
     assert all(map(torch.equal, kept.state_dict().values(), best.state_dict().values()))
-    assert np.isfinite(read(tmp_path / "results").goal_returns("anymal_push", "ppo", "turning")[1]).all()
+    assert np.isfinite(read(tmp_path / "results")["anymal_push"]["ppo"].returns("turning")).all()
     # Also where one of the runs, the better or the other, is known from results alone.
     for known in runs:
         where = tmp_path / f"extended_{known.seed}"
@@ -321,9 +402,9 @@ def test_a_later_stage_that_diverges_early_leaves_the_policy_of_the_one_before(t
     whole = (load_actor(folder, env, env.symmetry) for folder in (run.folder, run.folder / "stage_0"))
     assert all(map(torch.equal, *(actor.state_dict().values() for actor in whole)))
     write(tmp_path / "results", [run], [], {"workers": 1})
-    study = read(tmp_path / "results")
-    assert study.diverged("cartpole", "ppo") == {0}
-    assert np.isfinite(study.goal_returns("cartpole", "ppo")[1]).all()
+    results = read(tmp_path / "results")["cartpole"]["ppo"]
+    assert results.diverged == {0}
+    assert np.isfinite(results.returns()).all()
 
 
 def test_stages_follow_each_other_also_after_an_interruption(tmp_path):

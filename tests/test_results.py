@@ -10,16 +10,18 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import compare
 import results_page
 import seal
-from comparison import corrections, files, pool, provenance, study
+from comparison import corrections, files, pool, provenance, writing
 from comparison.files import Damaged, read_json, write_json, write_whole
 from comparison.records import EarlierResults, read_about, rows_of
 from comparison.run import Run
-from comparison.study import read, write
+from comparison.study import read
+from comparison.writing import write
 from tasks.settings import SETTINGS
 
 ROOT = Path(__file__).parents[1]
@@ -82,7 +84,7 @@ def test_a_damaged_result_is_named_kept_and_stops_no_other(runs, tmp_path, how, 
     with pytest.raises(Damaged, match=re.escape(str(path))):
         first.execute()
     write(tmp_path / "results", runs, failed, {})
-    assert read(tmp_path / "results").seeds("cartpole", "ppo") == [1]
+    assert read(tmp_path / "results")["cartpole"]["ppo"].seeds == [1]
     # What is known of it from before stays.
     write(tmp_path / "results", [second], [], {})
     before = (tmp_path / "results/runs.csv").read_text()
@@ -139,7 +141,7 @@ def test_collecting_names_what_is_damaged_and_goes_on(tmp_path, capsys, monkeypa
     assert compare.main(collect) == 1
     assert re.search(r"FAILED: cartpole ppo 0 .*seed_0.result\.json", capsys.readouterr().out)
     found = read(tmp_path / "output/custom")
-    assert found.seeds("cartpole", "ppo") == [1] and found.about["failed"] == ["cartpole ppo 0"]
+    assert found["cartpole"]["ppo"].seeds == [1] and found.about["failed"] == ["cartpole ppo 0"]
     assert found.about["workers"] is None, "not known here"
 
 
@@ -194,7 +196,7 @@ def test_a_damaged_description_is_named(runs, tmp_path, how):
         with pytest.raises(Damaged, match=f"{re.escape(str(path))}.*; .*{remedy}"):
             reader(folder)
     write(folder, runs, [], {})  # written anew from the runs
-    assert read(folder).seeds("cartpole", "ppo") == [0, 1]
+    assert read(folder)["cartpole"]["ppo"].seeds == [0, 1]
 
 
 def test_results_that_are_not_there_are_said_to_be_missing(tmp_path):
@@ -217,9 +219,9 @@ def test_results_that_are_killed_while_they_are_written_are_the_old_or_the_new_o
     folder, left = tmp_path / "results", 0
 
     def seeds():
-        found = read(folder)
-        assert found.curves.keys() == {("cartpole", "ppo", seed) for seed in found.seeds("cartpole", "ppo")}
-        return found.seeds("cartpole", "ppo")
+        found = read(folder)["cartpole"]["ppo"]
+        assert list(found.curves) == found.seeds
+        return found.seeds
 
     def dying(function):
         def call(*arguments):
@@ -231,7 +233,7 @@ def test_results_that_are_killed_while_they_are_written_are_the_old_or_the_new_o
 
         return call
 
-    monkeypatch.setattr(study, "revision", lambda: "r")  # it asks git
+    monkeypatch.setattr(writing, "revision", lambda: "r")  # it asks git
     write(folder, runs[:1], [], {})
     with monkeypatch.context() as patch:
         for name in ("fsync", "replace"):
@@ -294,25 +296,20 @@ def test_returns_of_falls_alone_are_left_out_by_rule():
         about = read_about(RESULTS / name)
         rows = rows_of(RESULTS / name, "curves.csv", about)
         known = [r for r in rows if r["stage"] == "1" and r["return"] != "nan"]
-        shown = {
-            (method, seed, iteration)
-            for (_, method, seed), curve in read(RESULTS / name).curves.items()
-            for iteration, stage, value in zip(
-                curve["iteration"], curve["stage"], curve["return"], strict=True
-            )
-            if stage == 1 and np.isfinite(value)
-        }
+        curves = read(RESULTS / name).curves
+        known_now = curves[(curves["stage"] == 1) & np.isfinite(curves["return"])]
+        shown = set(known_now[["method", "seed", "iteration"]].itertuples(index=False, name=None))
         gone = [r for r in known if (r["method"], int(r["seed"]), int(r["iteration"])) not in shown]
         blanked += len(gone)
         assert max(float(row["return"]) for row in gone) < 75
     assert blanked == 16
-    curve = {"stage": np.array([0, 1, 1]), "iteration": np.array([9, 9, 16]), "return": np.ones(3)}
-    assert np.isnan(corrections.corrected(curve, "9b1c0d2 4e5dd62")["return"]).tolist() == [
-        False,
-        True,
-        False,
+    curves = pd.DataFrame({"stage": [0, 1, 1], "iteration": [9, 9, 16], "return": 1.0})
+    curves = curves.assign(task="t", method="m", seed=0)
+    runs = curves[["task", "method", "seed"]].head(1)
+    left_out = [
+        corrections.corrected(curves, runs.assign(revision=r)) for r in ("9b1c0d2 4e5dd62", "9b1c0d2")
     ]
-    assert corrections.corrected(curve, "9b1c0d2") is curve
+    assert [list(np.isnan(each["return"])) for each in left_out] == [[False, True, False], [False] * 3]
 
 
 def test_the_command_is_recorded_as_it_was_given(monkeypatch, tmp_path):

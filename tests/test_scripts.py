@@ -12,8 +12,7 @@ from PIL import Image
 import results_page
 import speed
 from comparison import study
-from comparison.robot_tables import tables
-from tasks.settings import SETTINGS
+from comparison.tables import tables
 from tests.launch import Script
 from torchrl_sym.recipes import RunFolder
 

@@ -5,7 +5,7 @@ once, with the commits whose runs it concerns, and `study.read` leaves it out. W
 made again, the entry goes.
 """
 
-import numpy as np
+import pandas as pd
 
 # Until 6e928cf, the mean return of a stage after the first knew nothing of the episodes that were running
 # when it began. Before a whole episode was over, it was that of the episodes that had ended early: of falls
@@ -14,14 +14,16 @@ RETURNS_OF_FALLS = frozenset({"4e5dd62", "932a2af", "b00daf4", "dce851b", "a634e
 FIRST_EPISODE = 15  # iterations: 7.2 s of Push and Climb (episodes of 7 and 6 s), 4.8 s of Repose (5 s)
 
 
-def corrected(curve: dict[str, np.ndarray], revisions: str) -> dict[str, np.ndarray]:
-    """A run's curve without the returns of falls alone.
+def corrected(curves: pd.DataFrame, runs: pd.DataFrame) -> pd.DataFrame:
+    """Curves without the returns of falls alone.
 
     Args:
-        curve: columns of `curves.csv`.
-        revisions: the commits that trained it, separated by spaces.
+        curves: rows of `curves.csv`.
+        runs: rows of `runs.csv`, with the commits that trained each run, separated by spaces.
     """
-    if RETURNS_OF_FALLS.isdisjoint(revisions.split()):
-        return curve
-    wrong = (curve["stage"] > 0) & (curve["iteration"] <= FIRST_EPISODE)
-    return curve | {"return": np.where(wrong, np.nan, curve["return"])}
+    run = ["task", "method", "seed"]
+    commits = runs["revision"].fillna("").str.split()
+    old = ~commits.map(RETURNS_OF_FALLS.isdisjoint).astype(bool)
+    concerned = pd.MultiIndex.from_frame(curves[run]).isin(pd.MultiIndex.from_frame(runs.loc[old, run]))
+    wrong = concerned & (curves["stage"] > 0) & (curves["iteration"] <= FIRST_EPISODE)
+    return curves.assign(**{"return": curves["return"].mask(wrong)})

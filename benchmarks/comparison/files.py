@@ -5,13 +5,11 @@ new one. Files that belong together change in one moment too: the description of
 content, so a table whose renaming was still to come is found beside its place.
 """
 
-import contextlib
-import fcntl
 import hashlib
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -138,14 +136,3 @@ def read_table(path: Path, expected: Mapping[str, Any], remedy: str) -> str:
             return text
         found = f"{digest(text)['rows']} rows and another content"
     raise Damaged(f"expected {path} with its {expected['rows']} rows, as written, got {found}; {remedy}")
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Other processes that write into a folder wait until this one has done so."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)

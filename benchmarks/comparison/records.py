@@ -17,9 +17,14 @@ from typing import Any
 import numpy as np
 
 from comparison.files import Damaged, Kind, finish, read_json, read_table
-from comparison.run import Run, last_checkpoint
+from comparison.run import Run, completed, last_checkpoint
 
 RUN = ("task", "method", "seed")
+EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")  # then the behaviour
+CURVE = (
+    *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
+    *("std", "learning_rate", "kl", "success", "level", "phase", "collect_seconds", "physics_seconds"),
+)
 TABLES = ("runs.csv", "curves.csv")
 ABOUT: dict[str, Kind] = {"methods": dict, "command": str, "versions": dict, "machine": str}
 RESTORE = "restore it, such as by `git checkout`, or delete the folder and --collect again"
@@ -81,7 +86,7 @@ class EarlierResults:
     """Results that were written before, run by run.
 
     Args:
-        folder: where `study.write` has written; there may be nothing yet.
+        folder: where `writing.write` has written; there may be nothing yet.
 
     Raises:
         Damaged: a file of the results is not as it was written.
@@ -106,7 +111,8 @@ class EarlierResults:
         stages = self.about.get("methods", {}).get(run.task, {}).get(run.method)
         episodes = self.about.get("episodes")
         evaluations = {row["what"] for row in rows if "what" in row}
-        same = stages == _without_seed(asked["stages"]) and episodes == [run.episodes]
+        same = _without_seed(completed(stages or [])) == _without_seed(asked["stages"])
+        same = same and episodes == [run.episodes]
         if not same or evaluations - asked["evaluations"].keys():
             raise ValueError(
                 f"expected {self.folder} to hold {run} as it is asked for now, got other settings "
@@ -135,11 +141,11 @@ class EarlierResults:
 
     def _by_run(self, name: str) -> dict[tuple[str, str, int], list[dict[str, str]]]:
         """Rows of a table for every run, without empty entries."""
-        table = by_run(rows_of(self.folder, name, self.about)) if self.about else {}
-        return {
-            key: [{column: text for column, text in row.items() if text} for row in rows]
-            for key, rows in table.items()
-        }
+        grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
+        for row in rows_of(self.folder, name, self.about) if self.about else []:
+            key = (row["task"], row["method"], int(row["seed"]))
+            grouped.setdefault(key, []).append({column: text for column, text in row.items() if text})
+        return grouped
 
 
 def score(evaluated: Sequence[dict[str, Any]]) -> float | None:
@@ -172,7 +178,12 @@ def read_about(folder: Path) -> dict[str, Any]:
 
 
 def rows_of(folder: Path, name: str, about: dict[str, Any]) -> list[dict[str, str]]:
-    """Rows of a table of the results, which must be as it was written.
+    """Rows of a table of the results; see :func:`text_of`."""
+    return list(csv.DictReader(io.StringIO(text_of(folder, name, about))))
+
+
+def text_of(folder: Path, name: str, about: dict[str, Any]) -> str:
+    """A table of the results, which must be as it was written.
 
     Raises:
         Damaged: it is another one, or `study.json` knows none of that name.
@@ -180,7 +191,7 @@ def rows_of(folder: Path, name: str, about: dict[str, Any]) -> list[dict[str, st
     expected = about["tables"].get(name)
     if not isinstance(expected, dict) or {"rows", "sha256"} - expected.keys():
         raise Damaged(f"expected {folder / 'study.json'} to describe {name}, got {expected!r}; {RESTORE}")
-    return list(csv.DictReader(io.StringIO(read_table(folder / name, expected, RESTORE))))
+    return read_table(folder / name, expected, RESTORE)
 
 
 def finish_writing(folder: Path) -> None:
@@ -192,14 +203,6 @@ def finish_writing(folder: Path) -> None:
         tables = read_about(folder).get("tables", {})
         for name in TABLES:
             finish(folder / name, tables.get(name))
-
-
-def by_run(rows: Sequence[dict[str, str]]) -> dict[tuple[str, str, int], list[dict[str, str]]]:
-    """Rows of a table of the results by task, method and seed."""
-    grouped: dict[tuple[str, str, int], list[dict[str, str]]] = {}
-    for row in rows:
-        grouped.setdefault((row["task"], row["method"], int(row["seed"])), []).append(row)
-    return grouped
 
 
 def _without_seed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:

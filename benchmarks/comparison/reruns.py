@@ -6,15 +6,12 @@ judged for every method by the settings and curves that are stored, so that a ma
 rerun.
 """
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 
-from comparison.files import plain
-from comparison.methods import configure, label
-from comparison.run import task_setting
-from comparison.study import Study
+from comparison.run import described, task_setting
+from comparison.study import MethodResults
 from tasks.settings import SETTINGS
 
 RULES = {
@@ -32,25 +29,22 @@ _NOISE = {"std_schedule", "initial_std", "min_std", "max_std"}
 _RUN = {"seed", "checkpoint_interval", "device"}
 
 
-def marks(study: Study, task: str, method: str) -> str:
+def marks(results: MethodResults) -> str:
     """The marks of a method; empty if it would be trained alike today."""
-    stored = study.about["methods"].get(task, {}).get(method)
+    task, stored = results.task.name, results.stages
     if task not in OURS or not stored:
         return ""
-    today = [
-        {"config": plain(dataclasses.asdict(stage.config)), "task": plain(stage.task)}
-        for stage in configure(method, task_setting(task), 0).stages
-    ]
+    today = described(results.method.configure(task_setting(task), 0))
     before = [stage["config"] for stage in stored if "std_schedule" not in stage["config"]]
     late = any(c["adapt_every"] == "minibatch" and c["desired_kl"] is not None for c in before)
     other = len(stored) != len(today) or any(map(_differ, stored, today))
-    noisy = bool(before) and not _as_scheduled(study, task, method, today[-1]["config"]["std_schedule"])
+    noisy = bool(before) and not _as_scheduled(results, today[-1]["config"]["std_schedule"])
     return "".join(mark for mark, true in zip(RULES, (late, noisy, other), strict=True) if true)
 
 
-def marked(study: Study, task: str, method: str) -> str:
+def marked(results: MethodResults) -> str:
     """How tables call a method, with its marks."""
-    return f"{label(method)} {marks(study, task, method)}".rstrip()
+    return f"{results.label} {marks(results)}".rstrip()
 
 
 def footnote(found: str) -> str:
@@ -65,11 +59,11 @@ def _differ(stored: dict[str, Any], today: dict[str, Any]) -> bool:
     return stored["task"] != today["task"] or any(stored["config"][n] != config[n] for n in names)
 
 
-def _as_scheduled(study: Study, task: str, method: str, schedule: list[float] | None) -> bool:
+def _as_scheduled(results: MethodResults, schedule: list[float] | None) -> bool:
     """Whether all seeds had the deviation of a schedule in their last stage."""
     if schedule is None:
         return True
-    for curve in study.curves_of(task, method).values():
+    for curve in results.curves.values():
         last = curve["std"][curve["stage"] == curve["stage"].max()]
         if schedule[0] != schedule[1] or not np.allclose(last, schedule[0], rtol=1e-3):
             return False

@@ -7,7 +7,6 @@ and a finished one is recognised by its result. A file that is damaged is named 
 
 import contextlib
 import dataclasses
-import fcntl
 import functools
 import importlib
 import sys
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from filelock import FileLock
 from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -42,6 +42,7 @@ _RESULT: dict[str, Kind] = _REQUEST | {
 }
 _ROW: dict[str, Kind] = {"what": str, "actions": str, "goal": str, "return": (*_NUMBER, str)}
 _ORIGIN: dict[str, Kind] = {"revision": str, "versions": dict, "machine": str}
+_STAGE: dict[str, Kind] = {"config": dict, "task": dict}
 
 
 @dataclass(frozen=True)
@@ -71,18 +72,15 @@ class Run:
 
     def request(self) -> dict[str, Any]:
         """What was asked for, as JSON; numbers that are not finite as text, which JSON lacks."""
-        stages = [
-            {"config": plain(dataclasses.asdict(stage.config)), "task": plain(stage.task)}
-            for stage in self.setting.stages
-        ]
-        asked = {"task": self.task, "method": self.method, "seed": self.seed, "stages": stages}
+        asked = {"task": self.task, "method": self.method, "seed": self.seed}
+        asked["stages"] = described(self.setting)
         return asked | {"episodes": self.episodes, "evaluations": plain(self.setting.evaluations)}
 
     def result(self) -> dict[str, Any] | None:
         """The result, if this very run has been finished and its file is whole; see `damage`."""
         with contextlib.suppress(Damaged):
             result = self._stored()
-            if all(result.get(key) == value for key, value in self.request().items()):
+            if result and _asks(result, self.request()):
                 return result
         return None
 
@@ -127,7 +125,7 @@ class Run:
     def _read(self, name: str, kinds: dict[str, Kind], remedy: str) -> dict[str, Any]:
         path = self.folder / name
         content = read_json(path, kinds, remedy)
-        for key, each in {"evaluation": _ROW, "origins": _ORIGIN}.items():
+        for key, each in {"evaluation": _ROW, "origins": _ORIGIN, "stages": _STAGE}.items():
             for row in content.get(key, []):
                 check_kinds(path, row, each, remedy)
         return content
@@ -152,8 +150,7 @@ class Run:
             Damaged: a file of the run is; nothing is overwritten.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        with (self.folder / "lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
+        with FileLock(self.folder / "lock"):
             if message := self.damage():
                 raise Damaged(message)
             if self.result() is None:
@@ -166,7 +163,7 @@ class Run:
         """
         asked = {key: self.request()[key] for key in ("task", "method", "seed", "stages")}
         begun = self._begun()
-        if begun and any(begun.get(key) != value for key, value in asked.items()):
+        if begun and not _asks(begun, asked):
             raise ValueError(
                 f"expected {self.folder} to be new or to hold {self} as it is asked for now, got a run "
                 "with other settings (request.json); use another --name, or delete the folder"
@@ -214,6 +211,26 @@ class Run:
                     outcome = evaluate_plainly(many, actor, exploration)
                 rows += [{"what": what, "actions": actions, **row} for row in goal_rows(outcome)]
         return rows
+
+
+def described(setting: Setting) -> list[dict[str, Any]]:
+    """What every stage of a setting trains with, as JSON."""
+    return [
+        {"config": plain(dataclasses.asdict(stage.config)), "task": plain(stage.task)}
+        for stage in setting.stages
+    ]
+
+
+def _asks(stored: dict[str, Any], request: dict[str, Any]) -> bool:
+    """Whether a stored run is the requested one."""
+    stored = stored | {"stages": completed(stored["stages"])}
+    return all(stored.get(key) == value for key, value in request.items())
+
+
+def completed(stages: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What stored stages were trained with: a field that was added since then had its default."""
+    defaults = plain(dataclasses.asdict(PPOConfig()))
+    return [stage | {"config": defaults | stage["config"]} for stage in stages]
 
 
 def last_checkpoint(folder: Path) -> Path | None:

@@ -1,259 +1,291 @@
-"""The results of a comparison on disk: two tidy tables and a description, from which all else is drawn.
+"""The results of a comparison, read back: `study[task][method]` is what the seeds of one method did.
 
-* `runs.csv`: a row per run, evaluated task, kind of actions (mean or sampled) and goal.
-* `curves.csv`: a row per run and logged iteration of the training.
-* `study.json`: the command that was given (until c5f032c without its `--collect` and `--extend`), commits,
-  versions, machines; hyper-parameters per task and method; what failed; what the tables hold, so that one
-  which has lost rows is noticed.
-* `policies/TASK/METHOD`: the policy of the seed with the highest evaluated return, for tasks that
-  succeed or fail; `examples/watch.py` and `behaviour.py` read it.
+Tables, claims and figures ask it for numbers of all seeds: of `runs.csv` for evaluated returns, their
+variation between equivalent goals, successes; of `curves.csv` for what happened while training. Both are
+pandas frames. Numbers that many ask for are worked out once; a study is not changed after it was read.
 """
 
-import csv
+from __future__ import annotations
+
 import io
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from comparison.corrections import corrected
-from comparison.files import digest, locked, stage, write_json
-from comparison.provenance import command, joint_origin, revision
-from comparison.records import (
-    RUN,
-    TABLES,
-    EarlierResults,
-    Record,
-    by_run,
-    finish_writing,
-    from_folder,
-    policy_folder,
-    read_about,
-    rows_of,
-    score,
-)
-from comparison.run import Run
-from torchrl_sym.recipes import export_actor
+from comparison.intervals import iqm
+from comparison.methods import Method
+from comparison.progress import SHARE, SMOOTHING, crossing, has_curriculum, recovery, smooth, with_progress
+from comparison.records import CURVE, EVALUATION, RUN, TABLES, read_about, text_of
 
-EVALUATION = ("what", "actions", "goal", "return", "task_return", "success")  # then the behaviour
-CURVE = (
-    *("stage", "iteration", "frames", "seconds", "return", "mirror_loss", "log_prob", "log_prob_copies"),
-    *("std", "learning_rate", "kl", "success", "level", "phase", "collect_seconds", "physics_seconds"),
-)
-LAST_PHASE = 2.0  # of a curriculum in three phases
-POINTS = 105  # rows per curve that are kept, at most
+TEXT = ("task", "method", "outcome", "revision", "what", "actions", "goal")
+"""Columns that hold no numbers."""
+NUMBERS = ("return", "task_return", "success", "turning")
+"""Columns of `runs.csv` that figures are drawn of; a table that has none is filled with NaN."""
+LEAST = 1e-12  # of a symmetry loss whose logarithm is taken
 
 
-def write(
-    folder: Path,
-    runs: Sequence[Run],
-    failed: Sequence[Run],
-    about: dict[str, Any],
-    points: int = POINTS,
-    earlier: EarlierResults | None = None,
-) -> None:
-    """Write the results of all finished runs.
+class Study(Mapping[str, "TaskResults"]):
+    """Results of all tasks, in the order in which they were asked for.
 
     Args:
-        folder: where to.
-        runs: all runs; those that have no result are left out.
-        failed: runs that failed, of which nothing is read.
-        about: what else goes into `study.json`.
-        points: rows per curve that are kept, at most; the last one always is.
-        earlier: results with what is known of runs that are not finished in their folder.
-
-    Raises:
-        ValueError: the earlier results hold such a run with other settings.
-    """
-    finished: list[Record] = []
-    unfinished: list[str] = []
-    policies: dict[Path, list[tuple[float, Path]]] = {}  # scores and checkpoints of each method
-    methods: dict[str, dict[str, Any]] = {}
-    for run in runs:
-        record = None if run in failed else from_folder(run, points)
-        record = record or (earlier and earlier.record(run))
-        if record is None:
-            unfinished += [str(run)] * (run not in failed)
-            continue
-        finished.append(record)
-        methods.setdefault(run.task, {})[run.method] = record.stages
-        where, reached = policy_folder(folder, run.task) / run.method, score(record.evaluated)
-        if record.checkpoint and reached is not None:
-            policies.setdefault(where, []).append((reached, record.checkpoint))
-    for where, scored in policies.items():
-        _, best = max(scored, key=lambda pair: pair[0])
-        if best != where:
-            export_actor(best, where)
-    evaluated = [row for record in finished for row in record.evaluated]
-    first = (*RUN, "outcome", "revision", "frames", "seconds", *EVALUATION)
-    behaviour = dict.fromkeys(key for row in evaluated for key in row if key not in first)
-    curves = [row for record in finished for row in record.curve]
-    tables = (_table((*first, *behaviour), evaluated), _table((*RUN, *CURVE), curves))
-    origins = [each for record in finished for each in record.origins]
-    episodes = sorted({record.episodes for record in finished})
-    collected = {"command": command(), "collected_at": revision(), "episodes": episodes}
-    about = collected | joint_origin(origins) | about
-    about |= {"failed": [str(run) for run in failed], "methods": methods, "unfinished": unfinished}
-    _write_all(folder, about, dict(zip(TABLES, tables, strict=True)))
-
-
-def _write_all(folder: Path, about: dict[str, Any], tables: dict[str, str]) -> None:
-    """Replace the description and its tables in one moment: that of the description."""
-    folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
-        finish_writing(folder)
-        for name, text in tables.items():
-            stage(folder / name, text)
-        described = {name: digest(text) for name, text in tables.items()}
-        write_json(folder / "study.json", about | {"tables": described})
-        finish_writing(folder)
-
-
-def _table(columns: Sequence[str], rows: Sequence[dict[str, Any]]) -> str:
-    used = [name for name in columns if any(row.get(name) is not None for row in rows)]
-    file = io.StringIO()
-    writer = csv.DictWriter(file, used, extrasaction="ignore", restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: _short(value) for key, value in row.items()} for row in rows)
-    return file.getvalue()
-
-
-def _short(value: Any) -> Any:
-    return f"{value:.6g}" if isinstance(value, float) else value
-
-
-@dataclass(frozen=True)
-class Study:
-    """Results, read back.
-
-    Attributes:
         about: `study.json`.
-        runs: rows of `runs.csv`; numbers as floats, None where empty.
-        curves: columns of `curves.csv` by (task, method, seed), `corrected`.
+        runs: rows of `runs.csv`.
+        curves: rows of `curves.csv`.
     """
 
-    about: dict[str, Any]
-    runs: list[dict[str, Any]]
-    curves: dict[tuple[str, str, int], dict[str, np.ndarray]]
+    def __init__(self, about: dict[str, Any], runs: pd.DataFrame, curves: pd.DataFrame) -> None:
+        self.about = about
+        self.runs = _with_columns(runs, (*RUN, "outcome", *EVALUATION, *NUMBERS))
+        self.curves = _with_columns(curves, (*RUN, *CURVE))
+        self._tasks = {name: TaskResults(self, name) for name in about["methods"]}
+
+    def __getitem__(self, task: str) -> TaskResults:
+        return self._tasks[task]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tasks)
+
+    def __len__(self) -> int:
+        return len(self._tasks)
 
     @property
-    def tasks(self) -> list[str]:
-        """Tasks, in the order of the study."""
-        return list(self.about["methods"])
+    def trained(self) -> int:
+        """How many runs have a curve."""
+        return self.curves.groupby([*RUN]).ngroups
 
-    def methods(self, task: str) -> list[str]:
-        """Methods of a task, in the order of the study."""
-        return list(self.about["methods"].get(task, {}))
+    @property
+    def hours(self) -> float:
+        """Hours of training, of all runs together."""
+        return float(self.curves.groupby([*RUN], sort=False)["seconds"].last().sum()) / 3600
 
-    def seeds(self, task: str, method: str) -> list[int]:
-        """Seeds of a method."""
-        return list(dict.fromkeys(row["seed"] for row in self._rows(task, method)))
+    @property
+    def million_steps(self) -> float:
+        """Environment steps of the longest run."""
+        return float(self.curves["frames"].max()) / 1e6
 
-    def curve(self, task: str, method: str, column: str) -> tuple[np.ndarray, np.ndarray]:
-        """Million steps ``(points,)`` and a column of all seeds ``(seeds, points)``.
 
-        The column `progress` is the training return, or where there is a curriculum, in which returns fall
-        as tasks get harder, the level times the success rate: zero before the last phase and the last task
-        of the curriculum, and not continued once training leaves it for the last level alone. At every
-        point, a seed's value is its latest. So one that diverged keeps its last, and is not dropped from
-        the average; one that diverged before it had a value is.
-        """
-        own = self.with_progress if column == "progress" else self.curves_of
-        columns = list(own(task, method).values())
-        if not columns:
-            return np.zeros(0), np.zeros((0, 0))
-        steps = max(columns, key=lambda c: c["frames"][-1])["frames"]
-        values = []
-        for c in columns:
-            latest = np.searchsorted(c["frames"], steps, side="right") - 1
-            logged = c.get(column, np.full(len(c["frames"]), np.nan))
-            values.append(np.where(latest < 0, np.nan, logged[latest]))
-        values = np.array(values)
-        return steps / 1e6, values[np.isfinite(values[:, -1])]
+class TaskResults(Mapping[str, "MethodResults"]):
+    """Results of all methods on one task, in the order of the study."""
 
-    def with_progress(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
-        """Columns of a method's curves as far as `progress` goes, by seed; see :meth:`curve`."""
-        stages = self.about["methods"].get(task, {}).get(method) or []
-        return {seed: add_progress(c, stages) for seed, c in self.curves_of(task, method).items()}
+    def __init__(self, study: Study, name: str) -> None:
+        self.study = study
+        self.name = name
+        self.runs = study.runs[study.runs["task"] == name]
+        self.curves = study.curves[study.curves["task"] == name]
+        self._methods = {method: MethodResults(self, method) for method in study.about["methods"][name]}
 
-    def evaluations(self, task: str) -> list[str]:
-        """What was evaluated after training on a task, in order."""
-        return list(dict.fromkeys(r["what"] for r in self.runs if r["task"] == task and r.get("what")))
+    def __getitem__(self, method: str) -> MethodResults:
+        return self._methods[method]
 
-    def goal_returns(
-        self,
-        task: str,
-        method: str,
-        column: str = "return",
-        actions: str = "deterministic",
-        what: str | None = None,
-    ) -> tuple[list[str], np.ndarray]:
-        """Names of the goals, and their mean returns ``(seeds, goals)``, or another column of `runs.csv`.
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._methods)
+
+    def __len__(self) -> int:
+        return len(self._methods)
+
+    @property
+    def evaluations(self) -> list[str]:
+        """What was evaluated after training, in order."""
+        return list(self.runs["what"].dropna().unique())
+
+    @property
+    def has_success(self) -> bool:
+        """Whether episodes succeed or fail."""
+        return bool(self.runs["success"].notna().any())
+
+    @property
+    def has_split(self) -> bool:
+        """Whether it was logged what the time of training went into."""
+        return bool(np.isfinite(self.curves["physics_seconds"]).any())
+
+    @property
+    def has_phases(self) -> bool:
+        """Whether the curriculum has phases."""
+        return bool(np.isfinite(self.curves["phase"]).any())
+
+    @property
+    def has_curriculum(self) -> bool:
+        """Whether some run has levels and successes."""
+        return any(has_curriculum(curve) for each in self.values() for curve in each.curves.values())
+
+    @property
+    def measured(self) -> str:
+        """What tells how far a training has come; see `progress.py`."""
+        return "level times success rate" if self.has_curriculum else "training return"
+
+    @cached_property
+    def threshold(self) -> float:
+        """A progress that a good run makes, well above the first value."""
+        first, last = [], []
+        for results in self.values():
+            curve = results.curve("progress")
+            known = curve[np.isfinite(curve).all(axis=1)].to_numpy()
+            if known.size:
+                first.append(iqm(known[0]))
+                last.append(iqm(known[-1]))
+        return float((1 - SHARE) * np.min(first) + SHARE * np.max(last)) if first else float("nan")
+
+
+class MethodResults:
+    """What the seeds of one method did on one task.
+
+    Attributes:
+        task: the results that it is part of.
+        name: the method's, as in the tables.
+        stages: what each stage was trained with, of `study.json`.
+    """
+
+    def __init__(self, task: TaskResults, name: str) -> None:
+        self.task = task
+        self.name = name
+        self.stages: list[dict[str, Any]] = task.study.about["methods"][task.name][name] or []
+        self._runs = task.runs[task.runs["method"] == name]
+        own = task.curves[task.curves["method"] == name].drop(columns=["task", "method"])
+        self.curves: dict[int, pd.DataFrame] = {seed: c for seed, c in own.groupby("seed", sort=False)}
+
+    @cached_property
+    def method(self) -> Method:
+        """The method, parsed."""
+        return Method.parse(self.name)
+
+    @property
+    def label(self) -> str:
+        """How figures and tables call the method."""
+        return self.method.label
+
+    @property
+    def seeds(self) -> list[int]:
+        """Seeds that ended, also those that diverged."""
+        return list(self._runs["seed"].unique())
+
+    @property
+    def diverged(self) -> set[int]:
+        """Seeds that ended in numbers that are not finite."""
+        return set(self._runs["seed"][self._runs["outcome"] == "diverged"])
+
+    def evaluated(
+        self, column: str = "return", actions: str = "deterministic", what: str | None = None
+    ) -> pd.DataFrame:
+        """A figure of every seed (rows) on every equivalent goal (columns).
 
         Args:
-            task: a task of the study.
-            method: one of its methods.
-            column: `return`, `task_return`, `success`, `turning`.
+            column: of `runs.csv`: `return`, `task_return`, `success`, `turning`.
             actions: `deterministic` (mean actions) or `sampled`.
             what: one of the task's evaluations; the first by default.
         """
-        what = what or next(iter(self.evaluations(task)), None)
-        rows = self._rows(task, method)
-        rows = [r for r in rows if r.get("actions") == actions and r.get("what") == what]
-        goals = list(dict.fromkeys(r["goal"] for r in rows))
-        seeds = list(dict.fromkeys(r["seed"] for r in rows))
-        found = {(r["seed"], r["goal"]): r.get(column) for r in rows}
-        values = [[math.nan if found[s, g] is None else found[s, g] for g in goals] for s in seeds]
-        return goals, np.array(values).reshape(len(seeds), len(goals))
+        what = what or next(iter(self.task.evaluations), None)
+        rows = self._runs[(self._runs["actions"] == actions) & (self._runs["what"] == what)]
+        table = rows.pivot(index="seed", columns="goal", values=column)
+        return table.reindex(index=rows["seed"].unique(), columns=rows["goal"].unique())
 
-    def diverged(self, task: str, method: str) -> set[int]:
-        """Seeds of a method that ended in numbers that are not finite."""
-        return {r["seed"] for r in self._rows(task, method) if r["outcome"] == "diverged"}
+    def returns(self, column: str = "return", **which: str | None) -> np.ndarray:
+        """Mean over the goals, or that of another figure, ``(seeds,)``; see :meth:`evaluated`."""
+        return self.evaluated(column, **which).to_numpy().mean(axis=1)
 
-    def curves_of(self, task: str, method: str) -> dict[int, dict[str, np.ndarray]]:
-        """Columns of a method's curves, by seed."""
-        return {seed: c for (t, m, seed), c in self.curves.items() if (t, m) == (task, method)}
+    def variation(self, column: str = "return", **which: str | None) -> np.ndarray:
+        """Largest difference between two goals, ``(seeds,)``; see :meth:`evaluated`."""
+        values = self.evaluated(column, **which).to_numpy()
+        return values.max(axis=1) - values.min(axis=1)
 
-    def curves_of_task(self, task: str) -> list[dict[str, np.ndarray]]:
-        """Columns of all curves of a task."""
-        return [c for (t, _, _), c in self.curves.items() if t == task]
+    def chance_variation(self, what: str | None = None, actions: str = "deterministic") -> np.ndarray:
+        """Variation of success that chance explains, at most, ``(seeds,)``."""
+        rates = self.evaluated("success", actions, what).to_numpy()
+        return chance_variation(rates, min(self.task.study.about["episodes"]))
 
-    def _rows(self, task: str, method: str) -> list[dict[str, Any]]:
-        return [row for row in self.runs if (row["task"], row["method"]) == (task, method)]
+    @cached_property
+    def progress(self) -> dict[int, pd.DataFrame]:
+        """Curves as far as `progress` goes, by seed; see `progress.with_progress`."""
+        return {seed: with_progress(curve, self.stages) for seed, curve in self.curves.items()}
+
+    def curve(self, column: str) -> pd.DataFrame:
+        """A column of `curves.csv`, or `progress`, over million steps: a column per seed.
+
+        At every point, a seed's value is its latest. So one that diverged keeps its last, and is not
+        dropped from the average; one that diverged before it had a value is.
+        """
+        own = self.progress if column == "progress" else self.curves
+        if not own:
+            return pd.DataFrame()
+        steps = max((c["frames"] for c in own.values()), key=lambda frames: frames.iloc[-1])
+        latest = [c.set_index("frames")[column].reindex(steps, method="ffill") for c in own.values()]
+        table = pd.concat(latest, axis=1, keys=own).set_index(steps.to_numpy() / 1e6)
+        return table.loc[:, np.isfinite(table.iloc[-1])]
+
+    @property
+    def symmetry_loss(self) -> np.ndarray:
+        """Decimal logarithm of the last symmetry loss of every seed."""
+        curve = self.curve("mirror_loss").to_numpy()
+        return np.log10(np.maximum(curve[-1], LEAST)) if curve.size else np.zeros(0)
+
+    @property
+    def last_symmetry_loss(self) -> str:
+        """The interquartile mean of its logarithm, as a number of ordinary size."""
+        return f"{10 ** iqm(losses):.2g}" if len(losses := self.symmetry_loss) else "-"
+
+    @property
+    def seconds_per_step(self) -> float:
+        """Wall-clock seconds per environment step: the median over all logged intervals of all seeds."""
+        costs = [np.diff(c["seconds"]) / np.diff(c["frames"]) for c in self.curves.values()]
+        every = np.concatenate([np.zeros(0), *costs])
+        return float(np.median(every)) if len(every) else float("nan")
+
+    @cached_property
+    def crossings(self) -> np.ndarray:
+        """Million steps and seconds until each seed gets to the task's threshold, ``(seeds, 2)``."""
+        found = [crossing(self.progress.get(seed), self.task.threshold) for seed in self.seeds]
+        return np.array(found).reshape(-1, 2)
+
+    @property
+    def reached(self) -> tuple[int, int]:
+        """How many seeds reach the threshold, and how many there are."""
+        return int(np.isfinite(self.crossings[:, 0]).sum()), len(self.crossings)
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Million steps to the threshold; seeds that never reach it count as the whole curve."""
+        return np.minimum(self.crossings[:, 0], self.curve("progress").index[-1])
+
+    @property
+    def own_steps(self) -> np.ndarray:
+        """Million steps to `SHARE` of the way to each seed's own last value: speed, wherever it ends."""
+        curve = self.curve("progress")
+        levels = smooth(curve.to_numpy().T)
+        first = np.array([row[np.isfinite(row)][0] for row in levels])
+        there = levels >= ((1 - SHARE) * first + SHARE * levels[:, -1])[:, None]
+        return curve.index.to_numpy()[SMOOTHING - 1 :][there.argmax(axis=1)]
+
+    @property
+    def recoveries(self) -> np.ndarray:
+        """Million steps that each seed takes to recover in the last phase; see `progress.recovery`."""
+        return np.array([recovery(curve) for curve in self.progress.values()])
 
 
-def has_curriculum(curve: dict[str, np.ndarray]) -> bool:
-    """Whether a run has levels and successes."""
-    return all(np.isfinite(curve.get(name, np.nan)).any() for name in ("level", "success"))
+def chance_variation(rates: np.ndarray, episodes: int) -> np.ndarray:
+    """Variation between goals that succeed equally often, of as many episodes each, by chance.
 
-
-def add_progress(curve: dict[str, np.ndarray], stages: list[dict[str, Any]]) -> dict[str, np.ndarray]:
-    """A run's curve, as long as there is a curriculum, with a column `progress`; see `Study.curve`.
+    Expected range of normal draws with the binomial's deviation. Episodes count as independent, so it is
+    more than starts that are paired leave, of which an equivariant policy makes the same.
 
     Args:
-        curve: columns of the run.
-        stages: what each stage trained with, of `study.json`; empty for one task throughout.
+        rates: success rates, ``(seeds, goals)``.
+        episodes: of each goal.
+
+    Returns:
+        ``(seeds,)``.
     """
-    if not has_curriculum(curve):
-        return curve | {"progress": curve["return"]}
-    counts = np.ones(len(curve["frames"]))
-    if "phase" in curve:
-        counts *= np.nan_to_num(curve["phase"], nan=LAST_PHASE) == LAST_PHASE
-    tasks = [stage["task"] for stage in stages]
-    rising = [number for number, task in enumerate(tasks) if task.get("curriculum", True)]
-    if rising:
-        last = [number for number in rising if tasks[number] == tasks[rising[-1]]]
-        counts *= np.isin(curve["stage"], last)
-        curve = {name: values[curve["stage"] <= last[-1]] for name, values in curve.items()}
-        counts = counts[: len(curve["frames"])]
-    return curve | {"progress": curve["level"] * curve["success"] * counts}
+    draws = np.random.default_rng(0).normal(size=(20_000, rates.shape[1]))
+    mean = rates.mean(axis=1)
+    return np.ptp(draws, axis=1).mean() * np.sqrt(mean * (1 - mean) / episodes)
 
 
 def read(folder: Path) -> Study:
-    """Read what `write` wrote.
+    """Read what `writing.write` wrote, and leave out what it says wrongly (`corrections.py`).
 
     Raises:
         FileNotFoundError: there are no results.
@@ -262,23 +294,12 @@ def read(folder: Path) -> Study:
     about = read_about(folder)
     if not about:
         raise FileNotFoundError(f"expected results in {folder} (study.json), found none; run compare.py")
-    runs, rows = (rows_of(folder, name, about) for name in TABLES)
-    revisions = {key: each[0].get("revision", "") for key, each in by_run(runs).items()}
-    curves = {key: corrected(_columns(own), revisions[key]) for key, own in by_run(rows).items()}
-    return Study(about, [{key: _number(value) for key, value in row.items()} for row in runs], curves)
+    kinds: dict[str, Any] = defaultdict(lambda: float, dict.fromkeys(TEXT, str), seed=int)
+    how = {"dtype": kinds, "na_values": ["", "nan"], "keep_default_na": False}
+    runs, curves = (pd.read_csv(io.StringIO(text_of(folder, name, about)), **how) for name in TABLES)
+    return Study(about, runs, corrected(curves, runs))
 
 
-def _columns(rows: Sequence[dict[str, str]]) -> dict[str, np.ndarray]:
-    return {
-        name: np.array([float(row[name] or "nan") for row in rows]) for name in rows[0] if name not in RUN
-    }
-
-
-def _number(text: str) -> Any:
-    if text == "":
-        return None
-    try:
-        value = float(text)
-    except ValueError:
-        return text
-    return int(value) if value.is_integer() and text.lstrip("-").isdigit() else value
+def _with_columns(table: pd.DataFrame, names: tuple[str, ...]) -> pd.DataFrame:
+    """A table that has all of these columns: one that was not written says nothing."""
+    return table.reindex(columns=list(dict.fromkeys([*table.columns, *names])))
