@@ -13,6 +13,7 @@ import results_page
 import speed
 from comparison import study
 from comparison.tables import tables
+from tasks.settings import SETTINGS
 from tests.launch import Script
 from torchrl_sym.recipes import RunFolder
 
