@@ -135,7 +135,7 @@ def table(study: Study) -> str:
         rows.append([c])
         for f in families:
             own = returns[f, c]
-            mark = "**" * (len(own) == most[f] and own.mean() == best[f])
+            mark = "**" if len(own) == most[f] and own.mean() == best[f] else ""
             rows[-1].append(f"{mark}{own.mean():.3f} ({len(own)}){mark}")
     commits = ", ".join(study.about["revisions"])
     text = f"Made by `{study.about['command']}` ({commits}): mean evaluated return of {task} and, in "
