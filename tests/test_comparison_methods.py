@@ -1,4 +1,4 @@
-"""Names of compared methods: what they change, and what is refused."""
+"""The compared methods: names and what they change."""
 
 import dataclasses
 import math
