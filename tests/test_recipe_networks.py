@@ -6,6 +6,7 @@ import functools
 import pytest
 import torch
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import tasks
 from torchrl_sym.recipes import PPOConfig, load_actor, train
@@ -90,13 +91,13 @@ def test_a_price_keeps_a_relaxed_network_symmetric():
 
 def test_augmentation_changes_no_update_of_an_equivariant_policy():
     """Equation (sym-aug) is the same for every copy then, so that a step is that of plain PPO."""
-    env, results = environment("anymal_push"), []
+    results = []
     for augmentation in ("none", "all"):
+        env = environment.__wrapped__("anymal_push")  # a new one: episodes go on from those before
         config = dataclasses.replace(TINY, network="equivariant", augmentation=augmentation)
         torch.manual_seed(0)
         actor, critic = make_networks(config, env, env.symmetry)
-        env.set_seed(0)
-        with torch.no_grad():
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):  # of means, no gradient is left
             data = env.rollout(config.horizon, actor, break_when_any_done=False)
         learner = Learner(config, actor, critic, env.symmetry)
         rows = learner.estimate(data)
