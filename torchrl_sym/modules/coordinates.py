@@ -22,6 +22,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.modules.irreps import Irrep, irreps
@@ -130,16 +131,24 @@ class Coordinates:
         x = self._mixed(x, [matrix.to(x.dtype).T for matrix in matrices])
         return x if self._in_place[0] else x.index_select(0, scatter)
 
+    def identity_part(self, values: Tensor) -> Tensor:
+        """Coordinates of the first kind of what no element changes: ``(members, 1, copies, B)``.
+
+        Args:
+            values: of the copies of the identity's irreducible representation, ``(multiplicity[0], B)``.
+        """
+        members, copies = len(self.kinds[0].members), self.copies[0]
+        return functional.pad(values[None], (0, 0, 0, copies - len(values), 0, members - 1))[:, None]
+
+    def invariant(self, values: Tensor) -> Tensor:
+        """The columns with these coordinates alone, see :meth:`identity_part`."""
+        others = [*zip(self.kinds, self.copies, strict=True)][1:]
+        zeros = [values.new_zeros(len(k.members), k.dim, m, values.shape[1]) for k, m in others]
+        return self.join([self.identity_part(values), *zeros])
+
     def invariant_directions(self) -> Tensor:
         """Orthonormal vectors that no element changes, as columns, ``(dim, multiplicity[0])`` float64."""
-        shapes = zip(self.kinds, self.copies, strict=True)
-        count = self.multiplicity[0]
-        parts = [
-            torch.zeros(len(kind.members), kind.dim, copies, count, dtype=torch.float64, device="cpu")
-            for kind, copies in shapes
-        ]
-        parts[0][0, 0, :count] = torch.eye(count, dtype=torch.float64, device="cpu")
-        return self.join(parts)
+        return self.invariant(torch.eye(self.multiplicity[0], dtype=torch.float64, device="cpu"))
 
     def _mixed(self, x: Tensor, matrices: Sequence[Tensor]) -> Tensor:
         """Entries of components that mix in one way, ``[size, component]``, times their matrix."""

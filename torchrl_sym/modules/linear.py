@@ -128,7 +128,8 @@ class EquivariantLinear(nn.Module):
             parts: as :meth:`~torchrl_sym.modules.coordinates.Coordinates.split` gives them.
             bias: whether to add the bias.
         """
-        shift = self._shift() if bias else None
+        values = self._invariant() if bias else None
+        shift = None if values is None else self.target.identity_part(values).squeeze(1)
         found = []
         every = zip(self.source.kinds, parts, self._matrices(), self.target.copies, strict=True)
         for kind, part, weight, rows in every:
@@ -175,23 +176,19 @@ class EquivariantLinear(nn.Module):
         """What a parameter of a matrix counts: with that of nn.Linear, outputs vary as its outputs do."""
         return math.sqrt(self.in_rep.dim / max(shape[0] * shape[2], 1))
 
-    def _shift(self) -> Tensor | None:
-        """The bias in coordinates of the first kind, ``(members, rows, 1)``."""
+    def _invariant(self) -> Tensor | None:
+        """The bias in coordinates, ``(multiplicity[0], 1)``."""
         if self.bias is None:
             return None
-        members, rows = len(self.target.kinds[0].members), self.target.copies[0]
         (units,) = self._bias_units.on(self.bias.device)
-        shift = self.bias * units.to(self.bias.dtype)
-        return functional.pad(shift[None, :, None], (0, 0, 0, rows - len(shift), 0, members - 1))
+        return (self.bias * units.to(self.bias.dtype))[:, None]
 
     def dense_parameters(self) -> tuple[Tensor, Tensor | None]:
         """Weight and bias of the dense layer with the same outputs, as functions of the parameters."""
         eye = torch.eye(self.in_rep.dim, dtype=self.weight.dtype, device=self.weight.device)
         weight = self.target.join(self.between(self.source.split(eye), bias=False))
-        bias = None
-        if self.bias is not None:
-            zero = eye.new_zeros(self.in_rep.dim, 1)
-            bias = self.target.join(self.between(self.source.split(zero)))[:, 0]
+        values = self._invariant()
+        bias = None if values is None else self.target.invariant(values)[:, 0]
         if self.free_weight is not None:
             weight = weight + self.free_weight
             bias = None if bias is None or self.free_bias is None else bias + self.free_bias

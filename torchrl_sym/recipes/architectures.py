@@ -7,10 +7,8 @@ for a price (a residual pathway prior; Finzi et al., 2021), where the robot is n
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torchrl.modules import MLP
 
 from torchrl_sym.modules import EquivariantLinear, EquivariantMLP, symmetrize_
@@ -60,14 +58,3 @@ def scale_weights(net: nn.Module, factor: float, last: float) -> None:
     for layer in layers:
         for parameter in layer.parameters():
             parameter.mul_(factor * last if layer is layers[-1] else factor)
-
-
-def relaxation(networks: Iterable[nn.Module]) -> Tensor | None:
-    """Sum of squares of what may depart from equivariance; None where nothing may."""
-    free = [
-        layer.relaxation()
-        for network in networks
-        for layer in network.modules()
-        if isinstance(layer, EquivariantLinear) and layer.free_weight is not None
-    ]
-    return torch.stack(free).sum() if free else None

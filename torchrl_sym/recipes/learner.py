@@ -19,7 +19,7 @@ from torchrl.objectives.value import GAE
 
 from torchrl_sym.augment import SymmetryAugment
 from torchrl_sym.mirror_loss import MirrorLoss
-from torchrl_sym.recipes.architectures import relaxation
+from torchrl_sym.modules.linear import relaxation
 from torchrl_sym.recipes.compilation import compiled
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.networks import gaussian
@@ -124,8 +124,8 @@ class Learner:
         """All losses of a minibatch and their diagnostics."""
         with self._precision():
             out = {key: value for loss in self.losses for key, value in loss(minibatch).items()}
-        departed = relaxation([self.actor, self.critic])
-        if departed is not None:
+        if self.config.network == "relaxed":
+            departed = relaxation(self.actor) + relaxation(self.critic)
             out["loss_relaxation"] = self.config.relaxation_coeff * departed
         return out
 

@@ -106,17 +106,17 @@ def _untouched(model: MjModel, lonely: Numbers) -> str:
 def _shapes(c: Comparison, geoms: Numbers) -> Shapes:
     model, turn = c.model, c.matcher.matrix
     owners = weld_ids(model)[model.geom_bodyid[geoms]].astype(np.intp)
-    world, sizes = owners == 0, _sizes(c, owners)
     moved = np.array([c.map.bodies.get(int(b), int(b)) for b in owners])
+    world, here, there = owners == 0, _sizes(c, owners), _sizes(c, moved)
     return Shapes(
         geoms,
         np.where(world, "scenery", np.where(feels_fluid(model)[geoms], "dynamics", "collision")),
-        _features(model, c.data, geoms, turn, _sizes(c, moved)),
-        _features(model, c.image, geoms, np.eye(3), sizes),
+        _features(model, c.data, geoms, turn, there),
+        _features(model, c.image, geoms, np.eye(3), here),
         np.full(len(geoms), -1),
         np.full(len(geoms), np.inf),
         _contact_labels(model)[geoms],
-        _sizes(c, moved),
+        there,
     )
 
 
