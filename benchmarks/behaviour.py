@@ -27,11 +27,11 @@ import numpy as np
 import torch
 import tyro
 
+from comparison.environments import environment, task_setting
 from comparison.experiments import PRESETS
 from comparison.methods import Method
 from comparison.options import at_least_one, different
 from comparison.records import policy_folder
-from comparison.run import environment, task_setting
 from comparison.study import Study, read
 from plot import color
 from tasks import ALL_TASKS

@@ -14,6 +14,7 @@ tables; `plot.py` draws them; with `--extend`, only what they lack is trained.
 
 Your own task is `--tasks module:function`, a function that takes `num_envs` and `seed` and returns an
 environment with a `symmetry`; hyper-parameters are a `SETTING` in its module, or `--config KEY=VALUE ...`.
+A task with arguments of its own is trained and evaluated with them (`--tasks cartpole@motor_bias=0.5`).
 """
 
 import ast
@@ -28,12 +29,14 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from comparison import writing
+from comparison.environments import check_arguments, task_arguments, task_setting
 from comparison.experiments import OWN, PRESETS, Experiment
 from comparison.methods import METHOD_FIELDS, Method
 from comparison.options import at_least_one, different
 from comparison.pool import damaged, execute_all, report
 from comparison.records import EarlierResults
-from comparison.run import Run, task_setting
+from comparison.run import Run
+from tasks.settings import Setting
 from torchrl_sym.recipes import PPOConfig, RunFolder
 
 HERE = Path(__file__).parent
@@ -47,7 +50,7 @@ class Arguments:
     """A named set of experiments, instead of tasks, methods, seeds and steps."""
     # None: not given. A preset fixes what an option would change, also where it would change nothing.
     tasks: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TASK ...")] = None
-    """Names of tasks, or module:function (cartpole)."""
+    """Names of tasks, or module:function, also with arguments: cartpole@motor_bias=0.5 (cartpole)."""
     methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="METHOD ...")] = None
     """ppo, aug, aug-random, aug-naive, aug-naive-raw, equivariant, relaxed, loss-W, init-S, symmetric-init,
     sums of them (ppo aug)."""
@@ -59,6 +62,8 @@ class Arguments:
     """Changes of PPOConfig for all runs, such as num_envs=64 'hidden=(64,64)'."""
     episodes: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Evaluation episodes per goal (500)."""
+    under: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="KEY=VALUE ...")] = None
+    """Evaluate in addition with other arguments of the task, such as motor_bias=0.5, once for each."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Runs at a time (as many as there are cores)."""
     extend: bool = False
@@ -114,7 +119,7 @@ def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
     for experiment in chosen(arguments):
         for seed in range(experiment.seeds):
             for task in experiment.tasks:
-                setting = task_setting(task)
+                setting = evaluated_under(experiment.under, task)
                 for method in experiment.methods:
                     asked = Method.parse(method)
                     changed = asked.configure(setting, seed, experiment.steps, **experiment.config)
@@ -122,6 +127,16 @@ def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
                     more = (experiment.episodes, arguments.threads or 1)
                     runs[where] = Run(task, method, seed, changed, where, *more)
     return list(runs.values())
+
+
+def evaluated_under(under: Sequence[str], task: str) -> Setting:
+    """Settings of a task, evaluated also with other arguments of its own, by what these are."""
+    setting = task_setting(task)
+    usual = next(iter(setting.evaluations.values()))
+    more = {each: usual | task_arguments(each) for each in under}
+    for own in more.values():
+        check_arguments(task, own)
+    return dataclasses.replace(setting, evaluations=setting.evaluations | more)
 
 
 def check(arguments: Arguments) -> None:
@@ -160,6 +175,8 @@ def chosen(arguments: Arguments) -> Sequence[Experiment]:
     if "config" in given:
         different("config", given["config"], key=lambda text: text.partition("=")[0])
         given["config"] = dict(parse(text) for text in given["config"])
+    if "under" in given:
+        different("under", given["under"])
     experiment = dataclasses.replace(OWN, **given)
     different("tasks", experiment.tasks)
     different("methods", experiment.methods, key=Method.parse)

@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import tyro
 
+from comparison.environments import task_setting
 from comparison.files import write_whole
 from comparison.markdown import markdown
 from comparison.methods import Method
 from comparison.options import at_least_one, different
 from comparison.pool import execute_all, report
-from comparison.run import Run, task_setting
+from comparison.run import Run
 from comparison.writing import write
 from torchrl_sym.recipes import RunFolder
 

@@ -15,12 +15,13 @@ from torchrl.envs.utils import ExplorationType
 
 from comparison import claims, tables, verdicts
 from comparison import run as run_module
+from comparison.environments import environment, task_setting
 from comparison.files import write_json
 from comparison.intervals import Estimate, band, difference, estimate, iqm
 from comparison.judging import Evaluated
 from comparison.progress import crossing
 from comparison.records import EarlierResults
-from comparison.run import Run, environment, read_curve, task_setting
+from comparison.run import Run, read_curve
 from comparison.study import Study, read
 from comparison.writing import write
 from tasks.anymal_push import AnymalPush

@@ -7,14 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable
 
 import numpy as np
 
 from comparison.intervals import difference, iqm
-from comparison.judging import Claim, Evaluated, Judge
-from comparison.markdown import markdown
-from comparison.study import MethodResults, TaskResults
+from comparison.judging import Claims, Evaluated
+from comparison.study import MethodResults
 from comparison.verdicts import joined, more, no_gain, pair, verdict
 
 # A goal of CartPole that is solved by swinging the long way round costs about 2; half of it tells the two
@@ -27,36 +25,9 @@ SHARE_OF_RETURN = 0.05
 # The paper's variation without and with augmentation, of the task that it shares in numbers (Table I).
 REPORTED = {"cartpole": "0.353 and 0.003"}
 
-CLAIMS: list[Claim] = []
+CLAIMS = Claims()
 """In the order of the pages."""
-
-
-def claim(
-    text: str,
-    place: str,
-    *methods: str,
-    figure: str | None = "return",
-    needs: Callable[[Evaluated], object] = lambda on: True,
-) -> Callable[[Judge], Judge]:
-    """Enter a claim into the list where its judge is defined; see `Claim`."""
-
-    def enter(judge: Judge) -> Judge:
-        CLAIMS.append(Claim(text, place, methods, figure, needs, judge))
-        return judge
-
-    return enter
-
-
-def table(task: TaskResults, what: str | None = None) -> str:
-    """All claims that apply, with evidence and verdict, as Markdown.
-
-    Args:
-        task: results of a task.
-        what: one of its evaluations; the first by default.
-    """
-    on = Evaluated(task, what)
-    rows = [each.row(on) for each in CLAIMS if each.applies(on)]
-    return markdown(["claim", "place", "evidence here", "verdict"], rows, texts=4)
+claim, table = CLAIMS.claim, CLAIMS.table
 
 
 @claim("Augmentation yields the highest return.", "Sec. IV-C, Fig. 4, Table I", "ppo", "aug")

@@ -14,12 +14,13 @@ class Experiment:
     """Some methods on some tasks.
 
     Attributes:
-        tasks: names, or `module:function`.
+        tasks: names, see `environments.py`.
         methods: see `methods.py`.
         seeds: how many, from 0.
         steps: environment steps; None for what the task's settings say.
         config: changes of the configuration.
         episodes: evaluation episodes per goal.
+        under: arguments of the task with which it is evaluated in addition, such as `motor_bias=0.5`.
     """
 
     tasks: tuple[str, ...]
@@ -28,6 +29,7 @@ class Experiment:
     steps: int | None = None
     config: dict[str, Any] = field(default_factory=dict)
     episodes: int = 500
+    under: tuple[str, ...] = ()
 
 
 OWN = Experiment(("cartpole",), ("ppo", "aug"), 5)  # what a command line changes

@@ -13,10 +13,12 @@ from functools import cached_property
 import numpy as np
 
 from comparison.intervals import iqm
+from comparison.markdown import markdown
 from comparison.methods import Method
 from comparison.study import MethodResults, TaskResults
 from comparison.verdicts import Figure
 
+HEAD = ["claim", "place", "evidence here", "verdict"]
 FIGURES = {"return": "return", "task_return": "task return", "success": "success"}
 
 
@@ -123,3 +125,33 @@ class Claim:
             return [self.text, self.place, f"no seed of {', '.join(missing)} was evaluated", "-"]
         evidence, outcome = self.judge(on)
         return [self.text, self.place, evidence, f"**{outcome}**"]
+
+
+class Claims(list[Claim]):
+    """Claims in the order of a page, each entered where its judge is defined."""
+
+    def claim(
+        self,
+        text: str,
+        place: str,
+        *methods: str,
+        figure: str | None = "return",
+        needs: Callable[[Evaluated], object] = lambda on: True,
+    ) -> Callable[[Judge], Judge]:
+        """Enter a claim with the judge that is decorated; see `Claim`."""
+
+        def enter(judge: Judge) -> Judge:
+            self.append(Claim(text, place, methods, figure, needs, judge))
+            return judge
+
+        return enter
+
+    def table(self, task: TaskResults, what: str | None = None) -> str:
+        """All claims that apply, with evidence and verdict, as Markdown.
+
+        Args:
+            task: results of a task.
+            what: one of its evaluations; the first by default.
+        """
+        on = Evaluated(task, what)
+        return markdown(HEAD, [each.row(on) for each in self if each.applies(on)], texts=4)

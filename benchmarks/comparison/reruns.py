@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from comparison.run import described, task_setting
+from comparison.environments import task_setting
+from comparison.run import described
 from comparison.study import MethodResults
 from tasks.settings import SETTINGS
 

@@ -7,9 +7,6 @@ and a finished one is recognised by its result. A file that is damaged is named 
 
 import contextlib
 import dataclasses
-import functools
-import importlib
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +18,12 @@ from tensordict.nn import ProbabilisticTensorDictSequential
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import tasks
+from comparison.environments import environment
 from comparison.files import Damaged, Kind, check_kinds, plain, read_json, write_json
 from comparison.provenance import origin
 from tasks.environment import BatchedEnv
 from tasks.evaluation import Evaluation, evaluate
-from tasks.settings import SETTINGS, Setting
+from tasks.settings import Setting
 from torchrl_sym.recipes import PPOConfig, load_actor, read_metrics, train_stages
 from torchrl_sym.recipes.runs import read_progress, stage_folders, trained_folder
 
@@ -50,7 +47,7 @@ class Run:
     """What to train, and where.
 
     Attributes:
-        task: a name of `tasks.ALL_TASKS`, or `module:function`.
+        task: its name, see `environments.py`.
         method: its name in the results.
         seed: seed of weights, starts and exploration.
         setting: hyper-parameters, all stages.
@@ -289,48 +286,3 @@ def evaluate_plainly(
         f"expected episodes of at most {MAX_STEPS} steps, got some that go on; end them, for example with "
         "TransformedEnv(env, StepCounter(max_steps=...))"
     )
-
-
-def environment(task: str, threads: int = 1) -> Callable[..., EnvBase]:
-    """What makes a task's environments: called with `num_envs`, `seed` and the task's own arguments.
-
-    A module is looked for where Python finds others, then where the command was given. It is imported: let
-    no name in that was read from a file of somebody else.
-
-    Raises:
-        ValueError: neither a task's name nor an importable `module:function`.
-    """
-    if task in tasks.ALL_TASKS:
-        return functools.partial(tasks.make_env, task, num_threads=threads)
-    module, _, name = task.partition(":")
-    if "" not in sys.path:
-        sys.path.append("")  # last: no file there takes the place of a library or of the benchmarks
-    try:
-        make_env = getattr(importlib.import_module(module), name)
-        if not callable(make_env):
-            raise ValueError(f"{name} is a {type(make_env).__name__}")
-    except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"expected a task of {list(tasks.ALL_TASKS)}, or module:function that takes num_envs and seed "
-            f"and returns an environment with a symmetry, got {task!r} ({error})"
-        ) from error
-    return make_env
-
-
-def task_setting(task: str) -> Setting:
-    """Settings of a task; of another one, what its module calls SETTING, or the recipe's defaults.
-
-    Raises:
-        ValueError: no such task, or a SETTING that is none.
-    """
-    if task in SETTINGS:
-        return SETTINGS[task]
-    environment(task)
-    module = importlib.import_module(task.partition(":")[0])
-    setting = getattr(module, "SETTING", Setting(PPOConfig()))
-    if not isinstance(setting, Setting):
-        raise ValueError(
-            f"expected SETTING of {module.__name__} ({module.__file__}) to be a tasks.settings.Setting, "
-            f"got {type(setting).__name__}; wrap the configuration: Setting(PPOConfig(...))"
-        )
-    return setting
