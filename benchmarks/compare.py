@@ -86,7 +86,8 @@ def main(arguments: Arguments) -> int:
     import plot  # every run's process imports this file, and has no use for matplotlib and scipy
 
     name = arguments.name or arguments.preset or "custom"
-    shared = "paper" if (arguments.preset or "").startswith("paper") else name  # they have runs in common
+    common = (arguments.preset or "").startswith(("paper", "study"))  # these have runs in common
+    shared = "paper" if common else name
     runs = make_runs(arguments, arguments.folder / shared)
     folder = arguments.output / name
     earlier = EarlierResults(folder) if arguments.collect or arguments.extend else None

@@ -46,17 +46,12 @@ def draw_all(results: Path, plots: Path) -> list[Path]:
     """Draw everything that the results have; returns what was written."""
     study = read(results)
     plots.mkdir(parents=True, exist_ok=True)
-    drawn = {
-        "training": training(study),
-        "log_prob": log_prob(study),
-        "initialization": initialization(study),
-        "goals": goals(study),
-        "efficiency": efficiency(study),
-        "success": success(study),
-        "phases": phases(study),
-    }
+    figures = (training, log_prob, initialization, goals, efficiency, success, phases)
+    if all("@" in task for task in study):  # doses of an asymmetry: plot_study.py draws those
+        figures = ()
     written = []
-    for name, figure in drawn.items():
+    for draw in figures:
+        name, figure = draw.__name__, draw(study)
         if figure is not None:
             written.append(plots / f"{name}.png")
             figure.savefig(written[-1], dpi=110)

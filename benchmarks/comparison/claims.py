@@ -32,11 +32,7 @@ claim, table = CLAIMS.claim, CLAIMS.table
 
 @claim("Augmentation yields the highest return.", "Sec. IV-C, Fig. 4, Table I", "ppo", "aug")
 def _return(on: Evaluated) -> tuple[str, str]:
-    texts, outcomes = [], {}
-    for column, name in on.figures.items():
-        text, gap = pair(on.returns(column), on["aug"], on["ppo"])
-        texts.append(f"{name}: {text}" if len(on.figures) > 1 else text)
-        outcomes[name] = verdict(gap)
+    texts, outcomes = on.each("aug", "ppo")
     for prefix, loss in on.rivals(on.returns(), max, "best"):
         text, gap = pair(on.returns(), on["aug"], loss)
         texts.append(f"{prefix or 'return: '}{text}")
@@ -74,7 +70,7 @@ def _most_symmetric(on: Evaluated) -> tuple[str, str]:
 
 @claim("Augmentation keeps the symmetry loss low.", "Sec. IV-C, Fig. 4", "ppo", "aug", figure=None)
 def _low_loss(on: Evaluated) -> tuple[str, str]:
-    gap = _decades(on["ppo"], on["aug"])
+    gap = decades(on["ppo"], on["aug"])
     losses = ", ".join(f"{m.label} {m.last_symmetry_loss}" for m in (on["ppo"], on["aug"]))
     return f"{losses}; orders of magnitude {gap.format(1)}", verdict(gap)
 
@@ -91,8 +87,8 @@ def _one_sided(on: Evaluated) -> tuple[str, str]:
 @claim("Augmentation converges fastest.", "Sec. IV-C, Fig. 4", "ppo", "aug", figure=None)
 def _speed(on: Evaluated) -> tuple[str, str]:
     texts, outcomes = [], {}
-    for prefix, slower in [("", on["ppo"]), *on.rivals(_steps, min, "fastest")]:
-        text, gap = pair(_steps, slower, on["aug"], 2)
+    for prefix, slower in [("", on["ppo"]), *on.rivals(steps, min, "fastest")]:
+        text, gap = pair(steps, slower, on["aug"], 2)
         texts.append(f"{prefix}{text}")
         outcomes[f"than {slower.name}"] = verdict(gap)
     everything = "the whole curriculum"
@@ -145,7 +141,7 @@ def _weights(on: Evaluated) -> tuple[str, str]:
     levels = [on["ppo"], *_by_weight(on)]
     values = ", ".join(f"{m.label} {m.last_symmetry_loss}" for m in levels)
     return values, joined(
-        {f"from {a.label}": verdict(_decades(a, b)) for a, b in itertools.pairwise(levels)}
+        {f"from {a.label}": verdict(decades(a, b)) for a, b in itertools.pairwise(levels)}
     )
 
 
@@ -154,8 +150,8 @@ def _weights(on: Evaluated) -> tuple[str, str]:
 def _hinders(on: Evaluated) -> tuple[str, str]:
     losses = _by_weight(on)
     lower = {f"return of {m.name}": pair(on.returns(), on["ppo"], m) for m in losses}
-    slower = {f"speed of {m.name}": pair(_steps, m, on["ppo"], 2) for m in losses}
-    heavier, gap = pair(_steps, losses[-1], losses[0], 2)
+    slower = {f"speed of {m.name}": pair(steps, m, on["ppo"], 2) for m in losses}
+    heavier, gap = pair(steps, losses[-1], losses[0], 2)
     returns, speeds = (", ".join(text for text, _ in each.values()) for each in (lower, slower))
     outcomes = {name: verdict(each) for name, (_, each) in (lower | slower).items()}
     evidence = f"return: {returns}; million steps: {speeds}; {heavier}"
@@ -165,12 +161,12 @@ def _hinders(on: Evaluated) -> tuple[str, str]:
 @claim("Adding a mirror loss to augmentation does not help.", "Sec. IV-C, Fig. 4", "aug",
        needs=lambda on: on.with_loss)  # fmt: skip
 def _both(on: Evaluated) -> tuple[str, str]:
-    both, (in_return, in_steps) = on.with_loss, _margins(on)
+    both, (in_return, in_steps) = on.with_loss, margins(on)
     text, gain = pair(on.returns(), both, on["aug"])
     outcomes = {"return": no_gain(gain, in_return)}
     if in_steps is None:
         return f"return: {text}; margin {in_return:.3g}", joined(outcomes)
-    faster, saved = pair(_steps, on["aug"], both, 2)
+    faster, saved = pair(steps, on["aug"], both, 2)
     outcomes["speed"] = no_gain(saved, in_steps)
     return f"return: {text}; million steps: {faster}; margins {in_return} and {in_steps}", joined(outcomes)
 
@@ -181,14 +177,14 @@ def _large(on: Evaluated) -> tuple[str, str]:
     large, small = on["aug+init-4"], on["aug"]
     text, gap = pair(on.returns(), small, large)
     evidence = f"symmetry loss {large.last_symmetry_loss} with weights 4 times as large, "
-    outcomes = {"symmetry loss": verdict(_decades(large, small)), "lower return": verdict(gap)}
+    outcomes = {"symmetry loss": verdict(decades(large, small)), "lower return": verdict(gap)}
     return f"{evidence}{small.last_symmetry_loss} without; return: {text}", joined(outcomes)
 
 
 @claim("Small initial weights are better still.", "Sec. III-B, IV-D (by extension)", "aug", "aug+init-0.1")
 def _small(on: Evaluated) -> tuple[str, str]:
     text, gap = pair(on.returns(), on["aug+init-0.1"], on["aug"])
-    speed, faster = pair(_steps, on["aug"], on["aug+init-0.1"], 2)
+    speed, faster = pair(steps, on["aug"], on["aug+init-0.1"], 2)
     outcomes = {"higher return": verdict(gap), "speed": verdict(faster)}
     return f"return: {text}; million steps: {speed}", joined(outcomes)
 
@@ -199,7 +195,7 @@ def _repair(on: Evaluated) -> tuple[str, str]:
     broken, repaired = on["aug+init-4"], on["aug+loss-0.1+init-4"]
     text, gap = pair(on.returns(), on["aug"], repaired)
     evidence = f"symmetry loss {broken.last_symmetry_loss}, with loss-0.1 {repaired.last_symmetry_loss}; "
-    outcomes = {"symmetry": verdict(_decades(broken, repaired)), "return stays lower": verdict(gap)}
+    outcomes = {"symmetry": verdict(decades(broken, repaired)), "return stays lower": verdict(gap)}
     return f"{evidence}return: {text}", joined(outcomes)
 
 
@@ -210,17 +206,17 @@ def _random(on: Evaluated) -> tuple[str, str]:
     plain, every, one = (on[name] for name in ("ppo", "aug", "aug-random"))
     variations = [iqm(on.variation()(m)) for m in (one, every)]
     costs = [m.seconds_per_step / plain.seconds_per_step for m in (one, every)]
-    margin, _ = _margins(on)
+    margin, _ = margins(on)
     text = f"return: {text}; variation {variations[0]:.3f}, all {variations[1]:.3f}; time per step over "
     text += f"PPO's: {costs[0]:.2f}, all {costs[1]:.2f}; margin {margin:.3g}"
     return text, no_gain(loss, margin)
 
 
-def _steps(results: MethodResults) -> np.ndarray:
+def steps(results: MethodResults) -> np.ndarray:
     return results.steps
 
 
-def _decades(a: MethodResults, b: MethodResults):
+def decades(a: MethodResults, b: MethodResults):
     """By how many orders of magnitude the symmetry loss of one method is above that of another."""
     return difference(a.symmetry_loss, b.symmetry_loss)
 
@@ -229,7 +225,7 @@ def _by_weight(on: Evaluated) -> list[MethodResults]:
     return sorted(on.losses(), key=lambda results: results.method.weight)
 
 
-def _margins(on: Evaluated) -> tuple[float, float | None]:
+def margins(on: Evaluated) -> tuple[float, float | None]:
     """Differences that count as none: in return, and in million steps where that is said."""
     share = SHARE_OF_RETURN * abs(float(iqm(on.returns()(on["aug"]))))
     return MARGINS.get(on.task.name, (share, None))

@@ -16,7 +16,7 @@ from comparison.intervals import iqm
 from comparison.markdown import markdown
 from comparison.methods import Method
 from comparison.study import MethodResults, TaskResults
-from comparison.verdicts import Figure
+from comparison.verdicts import Figure, joined, pair, verdict
 
 HEAD = ["claim", "place", "evidence here", "verdict"]
 FIGURES = {"return": "return", "task_return": "task return", "success": "success"}
@@ -56,6 +56,20 @@ class Evaluated:
         """The methods with nothing but a mirror loss, and so many seeds."""
         found = [m for m in self.task.values() if m.method.weight]
         return [m for m in found if m.method == Method(weight=m.method.weight) and self.seeds(m) >= least]
+
+    def each(self, a: str, b: str) -> tuple[list[str], dict[str, str]]:
+        """Whether a method has more than another, for every figure: texts, and verdicts by name."""
+        texts, outcomes = [], {}
+        for column, name in self.figures.items():
+            text, gap = pair(self.returns(column), self[a], self[b])
+            texts.append(f"{name}: {text}" if len(self.figures) > 1 else text)
+            outcomes[name] = verdict(gap)
+        return texts, outcomes
+
+    def higher(self, a: str, b: str) -> tuple[str, str]:
+        """The same as evidence and one verdict."""
+        texts, outcomes = self.each(a, b)
+        return "; ".join(texts), joined(outcomes)
 
     @cached_property
     def varied(self) -> bool:
