@@ -99,7 +99,10 @@ def task_arguments(text: str) -> dict[str, Any]:
         call = ast.parse(f"dict({text})", mode="eval").body
         if not isinstance(call, ast.Call) or call.args or not call.keywords:
             raise ValueError("no keyword arguments alone")
-        return {str(keyword.arg): _value(keyword.value) for keyword in call.keywords}
+        found = {str(keyword.arg): _value(keyword.value) for keyword in call.keywords}
+        if len(found) < len(call.keywords):
+            raise ValueError("one of them twice")
+        return found
     except (SyntaxError, ValueError) as error:
         raise ValueError(
             f"expected arguments of a task such as motor_bias=0.5,wind=1.0, got {text!r} ({error})"

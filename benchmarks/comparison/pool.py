@@ -98,7 +98,9 @@ def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
         return f"FAILED with exit code {exitcode}: {text[-1] if text else 'no output'} (see {log})"
     if result["outcome"] != "finished":
         return f"{result['outcome']} (after {result['iterations']} iterations)"
-    rows = [row for row in result["evaluation"] if row["actions"] == "deterministic"]
+    first = result["evaluation"][0]["what"] if result["evaluation"] else None
+    kind = (first, "deterministic")
+    rows = [row for row in result["evaluation"] if (row["what"], row["actions"]) == kind]
     returns = ", ".join(f"{row['goal']} {float(row['return']):.2f}" for row in rows)
     return f"{returns} ({result['seconds']:.0f} s)"
 
