@@ -24,7 +24,7 @@ class Setting:
         then: further stages, each from the last state of the one before it.
         tuned: changes of the hyper-parameters by family of methods, where each was tuned by itself: plain
             PPO (``"ppo"``), augmentation (``"aug"``), mirror loss (``"loss"``), naive augmentation
-            (``"aug-naive"``).
+            (``"aug-naive"``), equivariant networks (``"equivariant"``) and relaxed ones (``"relaxed"``).
     """
 
     config: PPOConfig
@@ -126,7 +126,7 @@ _REPOSE_ON = dataclasses.replace(
 # of the networks has a constant cost, and no worse per step (3 seeds each, with and without copies). With
 # 1024 x 16 it is another seventh faster, but plain PPO learned less. `tuned` below is what
 # `python benchmarks/tune.py` chose for each family of methods, out of the same candidates and with as many
-# runs each (results/tuning).
+# runs each (results/tuning, results/tuning-networks).
 _CARTPOLE = PPOConfig(
     iterations=202,  # 3.3 M steps
     num_envs=512,
@@ -142,6 +142,8 @@ SETTINGS: dict[str, Setting] = {
             "aug": {"desired_kl": 0.02, "minibatches": 8},
             "loss": {"desired_kl": 0.02, "minibatches": 8},
             "aug-naive": {"desired_kl": 0.02, "gamma": 0.99, "minibatches": 8},
+            "equivariant": {"desired_kl": 0.02, "minibatches": 4},
+            "relaxed": {"desired_kl": 0.02, "minibatches": 4},
         },
     ),
     "anymal_push": Setting(_PUSH, _FAST, then=(Stage(_PUSH_ON, _FAST),)),
