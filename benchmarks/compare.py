@@ -29,6 +29,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from comparison import writing
+from comparison.cluster import cluster
 from comparison.environments import check_arguments, task_arguments, task_setting
 from comparison.experiments import OWN, PRESETS, Experiment
 from comparison.methods import METHOD_FIELDS, Method
@@ -66,6 +67,8 @@ class Arguments:
     """Evaluate in addition with other arguments of the task, such as motor_bias=0.5, once for each."""
     workers: Annotated[int | None, tyro.conf.arg(metavar="INT")] = None
     """Runs at a time (as many as there are cores)."""
+    ray: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="[ADDRESS]")] = None
+    """Run on a Ray cluster: at this address, or that of RAY_ADDRESS, or else of this machine alone."""
     extend: bool = False
     """Train only what the results lack: runs that they hold already stay in them as they are."""
     collect: bool = False
@@ -88,7 +91,7 @@ def main(arguments: Arguments) -> int:
     name = arguments.name or arguments.preset or "custom"
     common = (arguments.preset or "").startswith(("paper", "study"))  # these have runs in common
     shared = "paper" if common else name
-    runs = make_runs(arguments, arguments.folder / shared)
+    runs = make_runs(arguments, (arguments.folder / shared).absolute())
     folder = arguments.output / name
     earlier = EarlierResults(folder) if arguments.collect or arguments.extend else None
     known = [run for run in runs if earlier and run.result() is None and earlier.record(run)]
@@ -112,6 +115,16 @@ def main(arguments: Arguments) -> int:
     for path in plot.draw_all(folder, arguments.plots / name):
         print(f"wrote {path}")
     return 1 if failed else 0
+
+
+def execute(runs: Sequence[Run], arguments: Arguments) -> tuple[list[Run], int]:
+    """Execute what is not finished, here or on a cluster: runs that failed, and how many ran at a time."""
+    if arguments.ray is None:
+        workers = arguments.workers or os.cpu_count() or 1
+        return execute_all(runs, workers), workers
+    with cluster(*arguments.ray, threads=arguments.threads or 1) as (start, room):
+        workers = min(arguments.workers or room, room)
+        return execute_all(runs, workers, start), workers
 
 
 def make_runs(arguments: Arguments, folder: Path) -> list[Run]:
@@ -149,7 +162,9 @@ def check(arguments: Arguments) -> None:
     at_least_one(arguments, "seeds", "steps", "episodes", "workers", "threads")
     if arguments.name is not None and Path(arguments.name).name != arguments.name:
         raise ValueError(f"expected a --name without a path, got {arguments.name!r}; see --output")
-    ignored = ("extend", "workers", "threads")
+    if arguments.ray is not None and len(arguments.ray) > 1:
+        raise ValueError(f"expected --ray with one address or none, got {list(arguments.ray)}")
+    ignored = ("extend", "workers", "threads", "ray")
     given = [f"--{name}" for name in ignored if getattr(arguments, name) not in (None, False)]
     if arguments.collect and given:
         raise ValueError(

@@ -63,6 +63,12 @@ def test_symmetric_ppo():
     assert "iteration 1" in run("examples/symmetric_ppo.py", "2")
 
 
+@pytest.mark.slow
+def test_ray_collectors():
+    pytest.importorskip("ray", reason="Ray is an extra: pip install 'torchrl_sym[ray]'")
+    assert "iteration 1" in run("examples/ray_collectors.py", "2", "1")
+
+
 def test_memory():
     tiny = ["--seeds", "1", "--iterations", "2", "--num-envs", "4", "--steps", "5"]
     output = run("examples/memory.py", *tiny)

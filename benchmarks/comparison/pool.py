@@ -1,5 +1,7 @@
 """Executes runs in parallel: one process each, a bar for each, and none stops the others.
 
+Here they are processes; `cluster.py` has them on other machines.
+
 Processes are forked from a server that has imported everything once, so that a run starts in a fraction of
 a second. They report through their files alone (`Run.progress`), end with the process that started them,
 and may crash: what happened is in the run's `log.txt`.
@@ -10,7 +12,8 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 from tqdm import tqdm
 
@@ -33,8 +36,27 @@ def report(failed: Sequence[Run]) -> None:
         print(f"FAILED: {run} ({run.damage() or f'see {log}'})")
 
 
-def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
+class Worker(Protocol):
+    """What executes a run, here or elsewhere, as a process of `multiprocessing` does."""
+
+    @property
+    def exitcode(self) -> int | None: ...
+    def is_alive(self) -> bool: ...
+    def terminate(self) -> None: ...
+    def join(self) -> None: ...
+
+
+Start = Callable[[Run, dict[str, Any]], Worker]
+"""Starts a run, given the code that it is to be executed with (`provenance.origin`)."""
+
+
+def execute_all(runs: Sequence[Run], workers: int, start: Start | None = None) -> list[Run]:
     """Execute what is not finished, at most `workers` at a time; returns the runs that failed.
+
+    Args:
+        runs: all of them.
+        workers: runs at a time.
+        start: how a run is started; in a process of this machine by default.
 
     Raises:
         ValueError: less than one worker.
@@ -43,11 +65,10 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
         raise ValueError(f"expected at least one worker, got {workers}")
     failed = damaged(runs)
     runs = [run for run in runs if run not in failed]
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["torchrl_sym.recipes", "tasks.evaluation", "tyro", "tqdm"])
+    start = start or _processes()
     code = origin()  # that which the server loads now, whatever is committed while runs wait
     waiting = [run for run in runs if run.result() is None]
-    active: dict[int, tuple[Run, multiprocessing.Process, tqdm]] = {}  # by line on the screen
+    active: dict[int, tuple[Run, Worker, tqdm]] = {}  # by line on the screen
     total = sum(run.iterations for run in runs)
     before = total - sum(run.iterations - run.progress()[0] for run in waiting)
     bar = tqdm(total=total, initial=before, unit="it", smoothing=0.02, disable=None)
@@ -57,7 +78,8 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
         while waiting or active:
             for line in range(1, workers + 1):
                 if waiting and line not in active:
-                    active[line] = _start(context, waiting.pop(0), line, code)
+                    run = waiting.pop(0)
+                    active[line] = (run, start(run, code), _bar(run, line))
             time.sleep(POLL)
             for line, (run, process, own) in list(active.items()):
                 done, latest = run.progress()
@@ -83,12 +105,23 @@ def execute_all(runs: Sequence[Run], workers: int) -> list[Run]:
     return failed
 
 
-def _start(context, run: Run, line: int, code: dict) -> tuple[Run, multiprocessing.Process, tqdm]:
-    process = context.Process(target=_work, args=(run, code), name=str(run))
-    process.start()
-    own = tqdm(total=run.iterations, initial=run.progress()[0], position=line, leave=False, disable=None)
-    own.set_description(str(run))
-    return run, process, own
+def _processes() -> Start:
+    """Starts runs in processes of their own, forked from a server that has imported everything."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["torchrl_sym.recipes", "tasks.evaluation", "tyro", "tqdm"])
+
+    def start(run: Run, code: dict[str, Any]) -> Worker:
+        process = context.Process(target=_work, args=(run, code), name=str(run))
+        process.start()
+        return process
+
+    return start
+
+
+def _bar(run: Run, line: int) -> tqdm:
+    bar = tqdm(total=run.iterations, initial=run.progress()[0], position=line, leave=False, disable=None)
+    bar.set_description(str(run))
+    return bar
 
 
 def _report(run: Run, result: dict | None, exitcode: int | None) -> str:
