@@ -1,10 +1,15 @@
 """The study of networks and of asymmetry: tasks with arguments of their own, rules, page."""
 
+import math
+
 import numpy as np
 import pandas as pd
 import pytest
+import torch
+from torchrl.envs.utils import ExplorationType
 
 import compare
+import neutral
 import plot_study
 import study_page
 from comparison import doses, network_claims
@@ -165,6 +170,43 @@ def test_a_task_with_arguments_is_trained_and_evaluated_with_them(tmp_path):
 def test_arguments_that_a_task_does_not_take_are_refused_at_once(task, message):
     with pytest.raises(ValueError, match=message):
         task_setting(task)
+
+
+@pytest.mark.parametrize(("task", "element"), [("anymal_push", "reflect-y"), ("anymal_climb", "reflect-x")])
+def test_neutral_starts_are_their_own_image(task, element):
+    env = environment(task)(num_envs=1, seed=0, episode_seconds=0.2)
+    drawn, own = neutral.near_starts(env.task, 4, element)
+    image = env.task.transform_state(own, element)
+    assert neutral.differences(env.task, own.qpos, image.qpos).abs().max() < 1e-12
+    torch.testing.assert_close(own.mocap_pos, image.mocap_pos)
+    moved = neutral.differences(env.task, drawn.qpos, own.qpos).abs().amax(-1)
+    assert (moved > 1e-3).all() and (moved < 0.3).all()
+
+
+def test_who_leaves_neutral_starts():
+    env = environment("anymal_push")(num_envs=1, seed=0, episode_seconds=0.3)
+    _, own = neutral.near_starts(env.task, 2, "reflect-y")
+    still, lame = torch.zeros(12), torch.tensor([0.5, *[0.0] * 11])
+    played = [
+        neutral.play(
+            env.task,
+            lambda td, action=action: td.set("action", action.expand(*td.batch_size, 12)),
+            own,
+            ExplorationType.DETERMINISTIC,
+            "reflect-y",
+        )
+        for action in (still, lame)
+    ]
+    assert played[0].figures()["never_broken"] == 1.0 and math.isinf(
+        played[0].figures()["symmetric_seconds"]
+    )
+    assert played[1].figures()["never_broken"] == 0.0 and played[1].broken.max() < 0.2
+    rows = [
+        {"method": m, "actions": "sampled", "start": s, **p.figures()}
+        for m, p in zip("ab", played, strict=True)
+        for s in neutral.STARTS
+    ]
+    assert neutral.table(rows).splitlines()[2].startswith("| a | sampled | 0% | 0% |")
 
 
 def test_evaluations_under_other_arguments_come_on_top():
