@@ -120,6 +120,9 @@ class WarpSimulation(Engine):
         self.time = self._rows["time"]
         self._clock = wp.to_torch(self._data.time)  # of sensors and delays; its float32 would drift
         self._overflow = wp.to_torch(self._data.overflow)
+        self._unconstrained = wp.to_torch(
+            self._data.qacc_smooth
+        )  # acceleration without contacts and limits
         self._diverged = no
         self.num_diverged, self.num_overflowed = torch.zeros(2, dtype=torch.int64, device=self.device)
         self.seconds = 0.0
@@ -194,9 +197,14 @@ class WarpSimulation(Engine):
             mjw.step(self._physics, self._data)
 
     def _lost(self) -> Tensor:
-        """Rows that are too fast, too far away or not finite; no comparison holds for NaN."""
-        limits = {"qvel": self.max_velocity} | dict.fromkeys(("qpos", "act", "qacc_warmstart"), MAX_VALUE)
-        within = [(self._rows[name].abs() <= limit).all(dim=-1) for name, limit in limits.items()]
+        """Rows that are too fast, too far away, pushed too hard, or NaN, for which no comparison holds.
+
+        Above 1e18 or so the solver's cost is no float32 any more, and it returns its first guess: a force
+        that is beyond all limits would pass as none.
+        """
+        far = [self._rows[name] for name in ("qpos", "act", "qacc_warmstart")]
+        within = [(x.abs() <= MAX_VALUE).all(dim=-1) for x in (*far, self._unconstrained)]
+        within.append((self.qvel.abs() <= self.max_velocity).all(dim=-1))
         return ~torch.stack(within).all(dim=0)
 
     def _launch(self, name: str, work: Callable[[], None]) -> None:
@@ -231,8 +239,8 @@ class WarpSimulation(Engine):
         """Rows that diverged in the last :meth:`step`, ``(n,)`` bool on the device; do not write into it.
 
         A row diverges when its control, its state or what it was started with is not finite, when it moves
-        faster than ``max_velocity`` or is further away than MuJoCo allows, or when it had, or may have had,
-        more contacts or constraints than there is room for.
+        faster than ``max_velocity``, is further away or accelerated more than MuJoCo allows, or when it
+        had, or may have had, more contacts or constraints than there is room for.
         """
         return self._diverged
 
