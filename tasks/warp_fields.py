@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import importlib
 from typing import Any
 
 import mujoco
@@ -24,10 +25,9 @@ from torchrl_sym.extras import require
 
 require("tasks.warp_simulation", "gpu", {"mujoco": "3.17", "mujoco_warp": "3.17", "warp": "1.19"})
 
-import mujoco_warp as mjw
-import warp as wp
-
 mj: Any = mujoco  # its compiled modules have no type stubs
+mjw: Any = importlib.import_module("mujoco_warp")  # by name, for a type checker that has neither
+wp: Any = importlib.import_module("warp")
 PER_SIMULATION = tuple(
     field.name
     for field in dataclasses.fields(mjw.Model)
@@ -71,7 +71,7 @@ class Fields:
         tensor([2., 2., 2.])
     """
 
-    def __init__(self, model: Any, physics: mjw.Model, num_envs: int) -> None:
+    def __init__(self, model: Any, physics: Any, num_envs: int) -> None:
         self._model, self._physics, self._num_envs = model, physics, num_envs
         self._own: dict[str, Tensor] = {}  # the model's values, one row
         self.values: dict[str, Tensor] = {}

@@ -1,11 +1,4 @@
-"""The engine on mujoco_warp, run on the CPU: agreement with MuJoCo's C library, and its own promises.
-
-Kernels are compiled on first use and then kept (WARP_CACHE_PATH names another folder for them). To compile
-few, all tests share two models: CartPole, and a small one with contacts.
-"""
-
-import copy
-import pickle
+"""The engine on mujoco_warp, run on the CPU: agreement with MuJoCo's C library, and its own promises."""
 
 import mujoco
 import numpy as np
@@ -19,32 +12,10 @@ pytest.importorskip(
 from tasks.base import create
 from tasks.engine import Engine
 from tasks.simulation import Simulation
-from tasks.warp_fields import DERIVED, PER_SIMULATION, wp
+from tasks.warp_fields import wp
 from tasks.warp_simulation import CONSTRAINTS, CONTACTS, WarpSimulation
 from tests.test_host_waits import NoWaits, refused
-
-# A body on three feet that slides, hops and tips, a mocap body, an actuator with a state, a limited joint.
-MODEL = """
-<mujoco>
-  <option timestep="0.005" integrator="implicitfast" cone="elliptic" iterations="20" ls_iterations="20"/>
-  <worldbody>
-    <geom name="ground" type="plane" size="0 0 1"/>
-    <body name="target" mocap="true" pos="1 2 3"/>
-    <body name="body" pos="0 0 0.149">
-      <joint name="slide" type="slide" axis="1 0 0"/>
-      <joint type="slide" axis="0 0 1"/>
-      <joint name="hinge" type="hinge" axis="0 1 0" range="-90 90"/>
-      <geom size=".05" mass="1" pos="-.2 0 -.1"/>
-      <geom size=".05" mass="1" pos=".2 0 -.1"/>
-      <geom size=".05" mass="1" pos=".2 .1 -.1"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <general joint="slide" dyntype="filter" dynprm="0.05" gainprm="60"/>
-    <motor joint="hinge" gear="5"/>
-  </actuator>
-</mujoco>
-"""
+from tests.warp_models import MODEL, controls, relative, run, state, warp
 
 
 @pytest.fixture(scope="module")
@@ -55,29 +26,6 @@ def model():
 @pytest.fixture(scope="module")
 def cartpole():
     return create("cartpole")
-
-
-def warp(model, num_envs, **kwargs):
-    return WarpSimulation(model, num_envs, "cpu", **kwargs)
-
-
-def controls(steps, n, nu=2, seed=0):
-    return torch.rand(steps, n, nu, generator=torch.Generator().manual_seed(seed)) * 2 - 1
-
-
-def run(simulation, ctrl, substeps=2):
-    for u in ctrl:
-        simulation.step(u, substeps)
-    return simulation.save()["rows"]
-
-
-def state(simulation):
-    return torch.cat([simulation.qpos, simulation.qvel], dim=-1).double()
-
-
-def relative(x, y):
-    """Largest difference of every row, relative to the row's largest number or 1."""
-    return ((x - y).abs().amax(-1) / y.abs().amax(-1).clamp(min=1.0)).max().item()
 
 
 def test_cartpole_agrees_with_mujoco(cartpole):
@@ -327,137 +275,6 @@ def test_iterations_of_the_solver_are_no_loss_and_no_message(capfd):
     assert simulation._overflow.all(), "the limit was reached"
     assert not simulation.diverged().any()
     assert "iterations" not in capfd.readouterr().out
-
-
-def test_save_and_load_continue_bit_for_bit(model):
-    ctrl = controls(20, 4)
-    simulation, other = warp(model, 4), warp(model, 4)
-    simulation.expand("body_mass")[1] *= 2.0  # without refresh
-    simulation.expand("geom_friction")[2, :, 0] = 0.1
-    run(simulation, ctrl[:10])
-    run(other, controls(7, 4, seed=9))
-    other.expand("body_inertia")[3] *= 2.0
-    other.refresh()
-    saved = simulation.save()
-    assert saved.keys() == {"rows", "model.body_mass", "model.geom_friction"}
-    expected = run(simulation, ctrl[10:])
-    other.load(saved)
-    assert torch.equal(run(other, ctrl[10:]), expected)
-    assert not torch.equal(saved["rows"], expected), "save() must copy"
-    for engine in (warp(model, 3), Simulation(model, 4, 1)):
-        with pytest.raises(ValueError, match="expected saved rows of shape"):
-            engine.load(saved)
-
-
-@pytest.mark.parametrize(
-    "twin", [copy.deepcopy, lambda x: pickle.loads(pickle.dumps(x))], ids=["copy", "pickle"]
-)
-def test_copies_continue_bit_for_bit_in_memory_of_their_own(model, twin):
-    simulation = warp(model, 2, nconmax=5, njmax=30, max_velocity=50.0)
-    simulation.expand("body_mass")[1] *= 2.0
-    simulation.refresh()
-    ctrl = controls(6, 2)
-    ctrl[2, 0] = torch.nan
-    run(simulation, ctrl[:3])
-    other = twin(simulation)
-    assert (other.nconmax, other.njmax, other.max_velocity) == (5, 30, 50.0)
-    assert other.diverged().tolist() == [True, False] and int(other.num_diverged) == 1
-    assert torch.equal(run(other, ctrl[3:]), run(simulation, ctrl[3:]))
-    before = simulation.qpos.clone()
-    other.qpos.zero_()
-    assert torch.equal(simulation.qpos, before)
-
-
-def test_expanded_fields_act_per_row_as_in_mujoco(model):
-    reference, simulation = Simulation(model, 3, 1), warp(model, 3)
-    for engine in (reference, simulation):
-        assert engine.expand("geom_friction") is engine.expand("geom_friction")
-        engine.expand("geom_friction")[1, :, 0] = 0.2
-        engine.expand("body_mass")[2] *= 3.0
-        engine.refresh()
-        engine.write(None, torch.zeros(3, 3), torch.tensor([[1.0, 0.0, 0.0]]).expand(3, 3))
-        run(engine, torch.zeros(20, 3, 2))
-        assert (engine.qpos[0] - engine.qpos[1]).abs().max() > 1e-3
-        assert (engine.qpos[0] - engine.qpos[2]).abs().max() > 1e-5
-    torch.testing.assert_close(state(simulation), state(reference), rtol=0, atol=1e-3)
-    derived = simulation.save()
-    for name in ("body_invweight0", "dof_invweight0", "body_subtreemass", "actuator_acc0"):
-        theirs = [getattr(reference._batch.get_model(row), name) for row in range(3)]
-        ours = derived[f"derived.{name}"].double()
-        torch.testing.assert_close(ours, torch.from_numpy(np.stack(theirs)), rtol=1e-4, atol=1e-5)
-
-
-def test_refresh_of_some_rows_leaves_the_others(model):
-    simulation = warp(model, 3)
-    for name in ("body_mass", "body_inertia"):
-        simulation.expand(name)[:] *= 2.0
-    before = simulation.save()
-    simulation.refresh(torch.tensor([0, 2]))
-    derived = simulation.save()["derived.dof_invweight0"]
-    own = torch.from_numpy(model.dof_invweight0).float()
-    assert torch.equal(derived[1], own)
-    torch.testing.assert_close(derived[::2], (own / 2).expand(2, 3), rtol=1e-4, atol=0)
-    assert torch.equal(simulation.save()["rows"], before["rows"])
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("body_masss", "field: expected one of .*'body_masss'; .*'body_mass'"),
-        ("opt.gravity", "field: expected one of"),
-        ("tendon_damping", "tendon_damping: expected a field that mujoco_warp reads as it is"),
-        ("dof_damping", "dof_damping: expected a field that mujoco_warp reads as it is"),
-    ],
-)
-def test_fields_that_would_be_ignored_or_wrong_are_refused(name, message):
-    xml = MODEL.replace('<motor joint="hinge"', '<motor joint="hinge" damping="0.5"')
-    simulation = warp(mujoco.MjModel.from_xml_string(xml), 2)
-    assert simulation.expand("dof_armature").shape == (2, 3)
-    with pytest.raises(ValueError, match=message):
-        simulation.expand(name)
-
-
-def test_what_is_derived_can_be_expanded(model):
-    assert set(DERIVED) < set(PER_SIMULATION)
-    simulation = warp(model, 2)
-    simulation.expand("body_mass")[1] *= 2
-    simulation.refresh()
-    assert simulation.expand("body_subtreemass")[1, 0] == 2 * simulation.expand("body_subtreemass")[0, 0]
-    assert "model.body_subtreemass" in simulation.save()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda saved: saved.pop("rows"), r"expected saved with .*'rows'\], got "),
-        (lambda saved: saved.update(rows=None), "expected saved rows to be a Tensor, got NoneType"),
-        (lambda saved: saved.update(rows=saved["rows"].float()), "torch.float64, got .* and torch.float32"),
-        (lambda saved: saved["rows"].fill_(torch.nan), "expected finite saved rows"),
-        (lambda saved: saved.update({"model.body_mass": torch.ones(4)}), r"body_mass of shape \(2, 3\)"),
-        (lambda saved: saved.update({"model.nothing": torch.ones(1)}), "expected one of .*got 'nothing'"),
-        (lambda saved: saved.update({"derived.geom_size": torch.ones(1)}), r"got \['derived.geom_size', "),
-        (lambda saved: saved.update(columns=torch.ones(1)), r"got \['columns', "),
-    ],
-)  # fmt: skip
-def test_what_was_not_saved_is_not_loaded(model, change, message):
-    simulation = warp(model, 2)
-    simulation.expand("body_mass")
-    before, saved = simulation.save(), simulation.save()
-    change(saved)
-    with pytest.raises(ValueError, match=message):
-        simulation.load(saved)
-    assert torch.equal(simulation.save()["rows"], before["rows"])
-
-
-def test_data_is_a_copy_with_derived_fields(model):
-    simulation = warp(model, 2)
-    simulation.expand("body_mass")[1, 2] = 12.0
-    simulation.write(None, torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), torch.zeros(2, 3))
-    data = simulation.data(1)
-    np.testing.assert_allclose(data.xpos[2], [2.0, 0.0, 1.149], atol=1e-6)
-    assert data.qfrc_bias[1] == pytest.approx(12 * 9.81)
-    data.qpos[0] = 5.0
-    assert simulation.qpos[1, 0] == 2.0 and model.body_mass[2] == 3.0
 
 
 def test_room_follows_the_model(model, cartpole):
