@@ -2,9 +2,9 @@
 
 `WarpSimulation` steps n simulations of one model with mujoco_warp, on a CUDA device or, for tests, on the
 CPU. Its tensors share warp's memory, so that a policy, a task and the physics work on one copy of the state
-in one place. After construction, stepping copies nothing from the device and never waits for it: on CUDA
-the substeps of a control step are one graph, captured once, and whatever depends on the state is arithmetic
-with masks.
+in one place. Stepping copies nothing from the device and never waits for it: the substeps of a control
+step are one graph of kernels (captured in the first step, and again when a field of the model gets new
+arrays), and whatever depends on the state is arithmetic with masks.
 
 Differences from MuJoCo's own library that callers see:
 
@@ -140,7 +140,7 @@ class WarpSimulation(Engine):
                 f"expected a model that mujoco_warp can step, got one for which it says: {error} {remedy}"
             ) from error
         self._physics.opt.warn_overflow = 0  # or kernels print what is read from the flags here
-        self._physics.opt.graph_conditional = self._place.is_cuda and wp.is_conditional_graph_supported()
+        self._physics.opt.graph_conditional = self._place.is_cpu or wp.is_conditional_graph_supported()
         self._fields = Fields(model, self._physics, self.num_envs)
         self._graphs: dict[str, Any] = {}
         self._graph_arrays = 0  # fields with arrays of their own when the graphs were captured
@@ -208,21 +208,18 @@ class WarpSimulation(Engine):
         return ~torch.stack(within).all(dim=0)
 
     def _launch(self, name: str, work: Callable[[], None]) -> None:
-        """Run kernels in torch's current stream; on CUDA as a graph, captured once under this name."""
-        if not self._place.is_cuda:
-            with wp.ScopedDevice(self._place):
-                work()
-            return
+        """Run kernels in torch's current stream, as a graph that is captured once under this name."""
         if self._graph_arrays != len(self._fields.values):  # graphs hold the addresses of arrays
             self._graphs.clear()
             self._graph_arrays = len(self._fields.values)
         if name not in self._graphs:
             self._graphs[name] = self._capture(work)
-        wp.capture_launch(self._graphs[name], stream=wp.stream_from_torch(self.device))
+        stream = wp.stream_from_torch(self.device) if self._place.is_cuda else None
+        wp.capture_launch(self._graphs[name], stream)
 
     def _capture(self, work: Callable[[], None]) -> Any:
         before = {name: x.clone() for name, x in self._rows.items()}
-        torch.cuda.synchronize(self.device)
+        wp.synchronize_device(self._place)
         with wp.ScopedDevice(self._place):
             work()  # compiles and loads the kernels, which a capture cannot
             wp.synchronize_device(self._place)
