@@ -15,13 +15,14 @@ PIP_INSTALL := -m pip install --quiet --disable-pip-version-check -c constraints
 export OMP_NUM_THREADS ?= 1
 export MPLBACKEND ?= Agg
 
-.PHONY: help quickstart films test test-core test-mjlab check build lock clean
+.PHONY: help quickstart films gpu test test-core test-mjlab check build lock clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make quickstart   train PPO with and without symmetry on CartPole; watch ANYmal push a cube"
 	@echo "make films        the films of benchmarks/plots, from the policies of benchmarks/results"
 	@echo "make test         run all tests and doctests"
+	@echo "make gpu          the second physics engine, mujoco_warp, into .venv; make test then tests it too"
 	@echo "make test-core    the core's tests with nothing installed but TorchRL, on any Python that it supports"
 	@echo "make test-mjlab   the tests of MuJoCo models with mjlab and its MuJoCo 3.11"
 	@echo "make check        lint, formatting, types"
@@ -34,6 +35,11 @@ $(INSTALLED): pyproject.toml constraints.txt
 	@echo "Installing into $(VENV) (a few minutes the first time)"
 	$(BIN)/python $(PIP_INSTALL) --editable '.[dev]'
 	$(BIN)/python $(PIP_INSTALL) --no-deps rsl-rl-lib  # torchvision, which it names, is not needed
+	@touch $@
+
+# 150 MB more, for those who want it: without it, its tests are skipped.
+$(VENV)/.installed-gpu: $(INSTALLED)
+	$(BIN)/python $(PIP_INSTALL) --editable '.[gpu]'
 	@touch $@
 
 $(VENV)-core/.installed: pyproject.toml constraints.txt
@@ -65,6 +71,8 @@ $(BIN)/python examples/watch.py anymal_$(1) --checkpoint benchmarks/results/pape
 endef
 films: $(INSTALLED)
 	$(foreach task,push climb,$(foreach method,ppo aug,$(call film,$(task),$(method))))
+
+gpu: $(VENV)/.installed-gpu
 
 test: $(INSTALLED)
 	$(BIN)/python -m pytest --numprocesses auto --dist worksteal $(PYTEST_ARGS)

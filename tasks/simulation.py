@@ -2,8 +2,7 @@
 
 `Simulation` runs n copies of one MuJoCo model on a pool of C++ threads (`mujoco.batch`): set the
 controls, step, read the state through live tensors, write rows. It knows nothing of tasks, rewards
-or TorchRL, and an engine on another device (mujoco-warp) needs to offer no more than its public
-methods.
+or TorchRL; what those may rely on is the interface `tasks.engine.Engine`.
 
 Two rules make it safe to learn on. A simulation that diverges is reported once, by `diverged`, and
 put back at the model's reference configuration at rest, so that no later read sees NaN. And results
@@ -22,14 +21,14 @@ from mujoco.batch import Batch, SimulationError
 from torch import Tensor
 
 from tasks.checks import check_saved
+from tasks.engine import MAX_ENVS, Engine, given, positive_velocity
 from tasks.processes import LostThreads, by_value, from_value, prepare_for_forks
 from torchrl_sym import checks
 
-# More simulations or threads are refused, before the memory or the machine gives way.
-MAX_ENVS, MAX_THREADS = 2**20, 2**10
+MAX_THREADS = 2**10
 
 
-class Simulation:
+class Simulation(Engine):
     """n simulations of one MuJoCo model, stepped on a thread pool.
 
     The attributes ``qpos`` (n, nq), ``qvel`` (n, nv), ``time`` (n,), ``ctrl`` (n, nu),
@@ -73,12 +72,10 @@ class Simulation:
     ) -> None:
         num_envs = checks.whole("num_envs", num_envs, 1, MAX_ENVS)
         num_threads = checks.whole("num_threads (0 for all cores)", num_threads, 0, MAX_THREADS)
-        if not max_velocity > 0:
-            raise ValueError(f"expected max_velocity > 0, got {max_velocity}")
         self.model = model
         self.num_envs = num_envs
         self.num_threads = num_threads
-        self.max_velocity = max_velocity
+        self.max_velocity = positive_velocity(max_velocity)
         self._batch: Batch | LostThreads = Batch(model, num_envs, num_threads)
         self._one_thread = self._batch.nthread == 1
         self._stepping = False  # in some thread of this process
@@ -131,11 +128,7 @@ class Simulation:
         Returns:
             Whether any row diverged; :meth:`diverged` says which.
         """
-        if ctrl.shape != self.ctrl.shape:  # copy_ would broadcast
-            raise ValueError(
-                f"expected ctrl of shape {tuple(self.ctrl.shape)} (num_envs, actuators), got "
-                f"{tuple(ctrl.shape)}; check the task's control()"
-            )
+        self._check_control(ctrl)
         self.ctrl.copy_(ctrl)
         diverged = self._none_diverged
         if not math.isfinite(float(ctrl.sum())):
@@ -214,7 +207,8 @@ class Simulation:
         would otherwise carry the previous episode into the next one.
 
         Args:
-            ids: the rows, as numbers or a mask of n; None for all. k rows are written.
+            ids: the rows, as numbers or a mask of n; None for all. k rows are written; a mask also takes
+                values of all n rows, of which it chooses.
             qpos: ``(k, nq)``.
             qvel: ``(k, nv)``.
             mocap_pos: ``(k, nmocap, 3)``, or None for the model's.
@@ -226,28 +220,12 @@ class Simulation:
             ValueError: a value that is not finite, or a wrong shape.
         """
         rows = slice(None) if ids is None else ids
-        k = len(self._none_diverged[rows])
-        fields = {
-            "qpos": qpos,
-            "qvel": qvel,
-            "mocap_pos": mocap_pos,
-            "mocap_quat": mocap_quat,
-            "time": time,
-        }
-        given = {name: value for name, value in fields.items() if value is not None}
-        for name, value in given.items():
-            if not isinstance(value, Tensor):
-                kind = type(value).__name__
-                raise TypeError(f"{name}: expected a tensor, got {kind}; use torch.as_tensor")
-            expected = (k, *getattr(self, name).shape[1:])
-            if tuple(value.shape) != expected or not bool(value.isfinite().all()):
-                raise ValueError(
-                    f"expected finite {name} of shape {expected}, got shape {tuple(value.shape)} "
-                    f"with {int((~value.isfinite()).sum())} entries that are not finite; check "
-                    "how the start states are sampled"
-                )
+        start = given(qpos=qpos, qvel=qvel, mocap_pos=mocap_pos, mocap_quat=mocap_quat, time=time)
+        if ids is not None and ids.dtype == torch.bool:
+            start = {name: x[ids] if _rows(x) == self.num_envs else x for name, x in start.items()}
+        self._check_start(start, len(self._none_diverged[rows]), finite=True)
         self._state[rows] = self._reference
-        for name, value in given.items():
+        for name, value in start.items():
             getattr(self, name)[rows] = value.to(torch.float64)
 
     def expand(self, name: str) -> Tensor:
@@ -307,6 +285,10 @@ class Simulation:
             if key.startswith("model."):
                 own[key] = self.expand(key.removeprefix("model."))
         check_saved(saved, own)
+
+
+def _rows(value: Any) -> int | None:
+    return len(value) if isinstance(value, Tensor) and value.ndim else None
 
 
 def _numbers(ids: Tensor) -> Tensor:

@@ -19,10 +19,11 @@ DM_CONTROL = sys.version_info < (3, 13)  # it needs labmaze, which has no wheel 
 OF_MUJOCO = dict.fromkeys(
     ["torchrl_sym.mujoco", "torchrl_sym.bridges.frames", "torchrl_sym.bridges.mjlab"], "mujoco"
 )
+OF_GPU = {"tasks.warp_fields": "gpu", "tasks.warp_simulation": "gpu"}
 LACKS = {
     "core": OF_MUJOCO | {"torchrl_sym.recipes": "train", "tasks": "tasks"},
     "mujoco": {"torchrl_sym.recipes": "train", "tasks.paths": "tasks", "tasks.rendering": "tasks"},
-    "tasks": {} if DM_CONTROL else {"torchrl_sym.recipes": "train"},  # dm_control brings tqdm
+    "tasks": OF_GPU if DM_CONTROL else OF_GPU | {"torchrl_sym.recipes": "train"},  # dm_control brings tqdm
     "train": OF_MUJOCO | {"tasks": "tasks"},
 }
 ROBOT = """<mujoco><worldbody>

@@ -41,7 +41,7 @@ def test_every_pin_has_a_hash(lock, name):
 def test_every_dependency_is_pinned(lock):
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    parts = [line for part in ("dev", "mujoco", "tasks", "train") for line in extras[part]]
+    parts = [line for part in ("dev", "gpu", "mujoco", "tasks", "train") for line in extras[part]]
     required = [*project["dependencies"], *(line for line in parts if not line.startswith("torchrl_sym["))]
     names = {lock.normalized(re.match(r"[\w.-]+", line)[0]) for line in required}
     pins = {lock.normalized(pin.name) for pin in lock.pinned((ROOT / "constraints.txt").read_text())}
