@@ -1,4 +1,4 @@
-"""Updates recorded into CUDA graphs, as far as a CPU can tell: what a replay does, and when there is none."""
+"""Updates recorded into CUDA graphs, as far as a CPU can tell: what a replay does, and what is refused."""
 
 import dataclasses
 import functools
