@@ -121,9 +121,7 @@ def test_a_recording_that_fails_says_how_to_go_on(cuda):
     update, batch = Recorded(function), TensorDict(x=torch.ones(2), batch_size=[2])
     for _ in range(4):
         update(batch)
-    with pytest.raises(
-        RuntimeError, match=r"\(operation not permitted.*capturing\); start again"
-    ):
+    with pytest.raises(RuntimeError, match=r"\(operation not permitted.*capturing\); start again"):
         update(batch)
 
 

@@ -33,7 +33,7 @@ class PPOConfig:
     iterations: int = 400
     """Collect-and-learn rounds."""
     num_envs: int = 256
-    """Parallel environments."""
+    """Parallel environments, of all processes together."""
     horizon: int = 32
     """Steps per environment and iteration."""
     epochs: int = 4

@@ -61,9 +61,13 @@ class Learner:
         self.optimizer = FusedAdam(self.parameters, config.learning_rate, config.accelerated)
         self.losses = make_losses(config, actor, critic, symmetry)
         # TorchRL's faster form looks for the longest episode, and the host would wait for its length
-        form = False if config.accelerated else None
-        bounds = {"gamma": config.gamma, "lmbda": config.lmbda}
-        self.gae = GAE(**bounds, value_network=None, average_gae=True, vectorized=form)
+        self.gae = GAE(
+            gamma=config.gamma,
+            lmbda=config.lmbda,
+            value_network=None,
+            average_gae=True,
+            vectorized=False if config.accelerated else None,
+        )
         naive = config.augmentation == "naive"
         self.naive = SymmetryAugment(symmetry, log_prob_from=actor) if naive else None
         self.evaluate, self.update = self._evaluate, self._update

@@ -113,8 +113,8 @@ def train(
 
     Called in several processes, as ``torchrun`` starts them, after
     ``torch.distributed.init_process_group``, they share the training (:mod:`torchrl_sym.recipes.ranks`):
-    ``config`` is that of the whole, each process has its part of ``config.num_envs``, all yield the same
-    metrics, and only the first one writes.
+    ``config`` is that of the whole, each process has its part of ``config.num_envs``, all have to be
+    iterated over, all yield the same metrics, and only the first one writes. As many can continue a run.
 
     Args:
         config: hyper-parameters.
@@ -136,13 +136,15 @@ def train(
         the latest finished episodes), mirror_loss, log_prob and log_prob_copies (mean log pi_k of samples
         and of their copies), kl, every loss and diagnostic of the updates, learning_rate, std, seconds,
         frames_per_second, collect_seconds (for this iteration's data; updates and logging take the rest of
-        its time); and what the environment's own ``metrics()`` returns, if it has any (success rate, level
-        of the curriculum). It raises FloatingPointError when an observation, a loss or a gradient is not
-        finite; the last checkpoint is still good then.
+        its time; on an accelerator, what it takes to ask for the data); and what the environment's own
+        ``metrics()`` returns, if it has any (success rate, level of the curriculum). It raises
+        FloatingPointError when an observation, a loss or a gradient is not finite; the last checkpoint is
+        still good then.
 
     Raises:
         BlockingIOError: another process trains in the folder.
-        ValueError: the folder holds a run with another configuration or environment, or a damaged one.
+        ValueError: the folder holds a run with another configuration, environment or number of processes,
+            or a damaged one; or processes that cannot share the environments evenly.
         KeyError, ValueError: the environment and the symmetry do not fit.
         TypeError: the action is not continuous; or an environment's state that no checkpoint can hold.
         FileNotFoundError: there is no checkpoint to start from.
