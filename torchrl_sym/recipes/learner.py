@@ -60,13 +60,9 @@ class Learner:
             self.ranks.adopt(parameter.data)
         self.optimizer = FusedAdam(self.parameters, config.learning_rate, config.accelerated)
         self.losses = make_losses(config, actor, critic, symmetry)
-        # TorchRL's faster form looks for the longest episode, and the host would wait for its length
+        # the vectorized form would have the host wait for the length of the longest episode
         self.gae = GAE(
-            gamma=config.gamma,
-            lmbda=config.lmbda,
-            value_network=None,
-            average_gae=True,
-            vectorized=False if config.accelerated else None,
+            gamma=config.gamma, lmbda=config.lmbda, value_network=None, average_gae=True, vectorized=False
         )
         naive = config.augmentation == "naive"
         self.naive = SymmetryAugment(symmetry, log_prob_from=actor) if naive else None
