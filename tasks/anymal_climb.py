@@ -17,7 +17,7 @@ from torch import Tensor
 
 from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
-from tasks.curriculum import Averages, levels, next_level
+from tasks.curriculum import Curriculum
 from tasks.draws import draws
 from tasks.state import State
 from torchrl_sym import checks
@@ -90,9 +90,8 @@ class AnymalClimb(Anymal):
     ) -> None:
         self.height = checks.real("height", height, LOWEST_BOX)
         self.phase = checks.one_of("phase", phase, PHASES)
-        self.curriculum = checks.flag("curriculum", curriculum)
+        self.curriculum = Curriculum(LAST_LEVEL, "success", "level", "distance", rising=curriculum)
         super().__init__(**robot)
-        self.averages = Averages("success", "level", "distance")
         self._grid_x, self._grid_y = (grid.clone() for grid in torch.cartesian_prod(*_axes()).unbind(-1))
         footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
         self._below = footprint.nonzero().squeeze(1)
@@ -113,32 +112,36 @@ class AnymalClimb(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """A box of full height in front, on the left; any heading in phase C, else towards the box."""
-        return self._start(levels(n, LAST_LEVEL), generator, vary=0.0)
+        return self._start(self.curriculum.hardest(n), generator, vary=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        return self.mapped_at_random(self._start(level, generator, vary=0.2 * self.curriculum), generator)
+        return self._training_start(self.curriculum.start(n), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: higher boxes after success, lower ones after failure, the next phase."""
-        distance = self._distance(finished)
-        success, fallen = self.success(finished), self.fallen(finished, LOWEST)
-        whole = fallen | self._over(finished)
-        level = finished.variables["level"][:, 0]
-        self.averages.update(success=success[whole], level=level[whole], distance=distance[whole])
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        self._advance()
-        failure = whole & ~success & (fallen | (distance > FAILURE_DISTANCE))
-        level = next_level(level, whole & success, failure, LAST_LEVEL, generator)
-        return self.mapped_at_random(self._start(level, generator, vary=0.2), generator)
+        distance, fallen = self._distance(finished), self.fallen(finished, LOWEST)
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=fallen | self._over(finished),
+            success=self.success(finished),
+            failed=fallen | (distance > FAILURE_DISTANCE),
+            generator=generator,
+            distance=distance,
+        )
+        if self.curriculum.rising:
+            self._advance()
+        return self._training_start(level, generator)
+
+    def _training_start(self, level: Tensor, generator: torch.Generator | None) -> State:
+        start = self._start(level, generator, vary=0.2 * self.curriculum.rising)
+        return self.mapped_at_random(start, generator)
 
     def _advance(self) -> None:
-        values = self.averages.values
+        values = self.curriculum.averages.values
         if self.phase != "C" and values["success"] > PHASE_SUCCESS and values["level"] > PHASE_LEVEL:
             self.phase = "B" if self.phase == "A" else "C"
-            self.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
+            self.curriculum.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
 
     def _start(self, level: Tensor, generator: torch.Generator | None, vary: float) -> State:
         """Starts with the box in front, its centre on the left.
@@ -268,18 +271,18 @@ class AnymalClimb(Anymal):
 
     def metrics(self) -> dict[str, float]:
         """Averages over about 500 training episodes, and the phase (0, 1, 2 for A, B, C)."""
-        return {**self.averages.values, "phase": float("ABC".index(self.phase))}
+        return {**self.curriculum.averages.values, "phase": float("ABC".index(self.phase))}
 
     def state_dict(self) -> dict[str, Any]:
         """Phase and averages; levels are part of the state of the rows."""
-        return {"phase": self.phase, "averages": dict(self.averages.values)}
+        return {"phase": self.phase, "averages": dict(self.curriculum.averages.values)}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         phase, averages = checks.entries("saved", saved, "phase", "averages")
         checks.one_of("phase", phase, PHASES)
-        self.averages.load(averages)
-        if self.curriculum:  # without one it stays what was asked for
+        self.curriculum.averages.load(averages)
+        if self.curriculum.rising:  # without one it stays what was asked for
             self.phase = phase
 
 

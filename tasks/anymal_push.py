@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
 from tasks.base import Entry, register
-from tasks.curriculum import Averages, levels, next_level
+from tasks.curriculum import Curriculum
 from tasks.draws import draws
 from tasks.state import State
 from torchrl_sym import Representation, checks
@@ -87,8 +87,7 @@ class AnymalPush(Anymal):
 
     def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
         super().__init__(**robot)
-        self.curriculum = checks.flag("curriculum", curriculum)
-        self.averages = Averages("success", "level")
+        self.curriculum = Curriculum(LAST_LEVEL, "success", "level", rising=curriculum)
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, then where the cube is, and where it has to go."""
@@ -106,27 +105,28 @@ class AnymalPush(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """Cube and target in front on the left, at any distance of the curriculum."""
-        return self._start(levels(n, LAST_LEVEL), generator, spread=0.0)
+        return self._start(self.curriculum.hardest(n), generator, spread=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Any direction; near targets, or with ``curriculum=False`` the whole range."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        start = self._start(level, generator, spread=0.5 if self.curriculum else 0.0)
-        return self.mapped_at_random(start, generator)
+        return self._training_start(self.curriculum.start(n), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: the next target is farther after success, nearer after no progress."""
-        level = finished.variables["level"][:, 0]
         distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
         over = finished.time > self.episode_seconds - self.control_timestep / 2
-        whole = over | self.fallen(finished, LOWEST)
-        success = whole & self.success(finished)
-        self.averages.update(success=success[whole], level=level[whole])
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        failure = whole & ~success & (distance > 0.7 * start)
-        level = next_level(level, success, failure, LAST_LEVEL, generator)
-        return self.mapped_at_random(self._start(level, generator, spread=0.5), generator)
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=over | self.fallen(finished, LOWEST),
+            success=self.success(finished),
+            failed=distance > 0.7 * start,
+            generator=generator,
+        )
+        return self._training_start(level, generator)
+
+    def _training_start(self, level: Tensor, generator: torch.Generator | None) -> State:
+        spread = 0.5 if self.curriculum.rising else 0.0
+        return self.mapped_at_random(self._start(level, generator, spread), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None, spread: float) -> State:
         """Starts with the cube in front on the left and the target behind it.
@@ -219,15 +219,15 @@ class AnymalPush(Anymal):
 
     def metrics(self) -> dict[str, float]:
         """Success rate and level, averaged over about the last 500 training episodes."""
-        return dict(self.averages.values)
+        return dict(self.curriculum.averages.values)
 
     def state_dict(self) -> dict[str, Any]:
         """The averages; levels are part of the state of the rows."""
-        return {"averages": dict(self.averages.values)}
+        return {"averages": dict(self.curriculum.averages.values)}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.load(*checks.entries("saved", saved, "averages"))
+        self.curriculum.averages.load(*checks.entries("saved", saved, "averages"))
 
 
 def facing(turn: Tensor, toward: Tensor) -> Tensor:

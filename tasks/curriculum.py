@@ -1,4 +1,8 @@
-"""Curricula: how hard the next episode is, judged by how the last one ended."""
+"""Curricula: how hard the next episode is, judged by how the last one ended.
+
+A level is a whole number that travels with the state of a row: what is hard at it is the task's affair (how
+far a target is, how high a box), how it rises and falls is the same for all (`Curriculum`).
+"""
 
 from __future__ import annotations
 
@@ -95,3 +99,66 @@ class Averages:
             if isinstance(value, bool) or not isinstance(value, float | int):
                 raise TypeError(f"average {name!r}: expected a number, got {checks.shown(value)}")
         self.values = {name: float(values.get(name, math.nan)) for name in self.values}
+
+
+class Curriculum:
+    """Levels of the next episodes, from how the last ones ended, and averages over those.
+
+    Args:
+        last: the highest level.
+        *figures: what is averaged over whole episodes, in this order; ``success`` and ``level`` among it.
+        rising: whether episodes begin at level 0 and rise with success; if not, all are of the last level.
+
+    Attributes:
+        last: the highest level.
+        rising: whether levels rise.
+        averages: the running averages.
+
+    Example:
+        >>> curriculum = Curriculum(7, "success", "level")
+        >>> yes, no = torch.tensor([True, True]), torch.tensor([False, False])
+        >>> curriculum.judge(curriculum.start(2), whole=yes, success=~no, failed=no, generator=None)
+        tensor([1., 1.], dtype=torch.float64)
+        >>> curriculum.averages.values
+        {'success': 1.0, 'level': 0.0}
+    """
+
+    def __init__(self, last: int, *figures: str, rising: bool = True) -> None:
+        self.last = checks.whole("last", last, 1)
+        self.rising = checks.flag("curriculum", rising)
+        self.averages = Averages(*figures)
+
+    def start(self, n: int) -> Tensor:
+        """Levels of n rows that have not played yet, ``(n,)``."""
+        return levels(n, 0 if self.rising else self.last)
+
+    def hardest(self, n: int) -> Tensor:
+        """The last level, that of the task itself, for n rows, ``(n,)``."""
+        return levels(n, self.last)
+
+    def judge(
+        self,
+        level: Tensor,
+        *,
+        whole: Tensor,
+        success: Tensor,
+        failed: Tensor,
+        generator: torch.Generator | None,
+        **figures: Tensor,
+    ) -> Tensor:
+        """Levels of the next episodes, ``(n,)``: one up after success, one down after failure.
+
+        Args:
+            level: levels of the last ones, ``(n,)``.
+            whole: which of them were played to an end; the others say nothing, and are repeated.
+            success: which of them succeeded.
+            failed: which failed badly, unless they succeeded.
+            generator: source of the draws.
+            **figures: what else is averaged.
+        """
+        success = whole & success
+        ended = {"success": success, "level": level, **figures}
+        self.averages.update(**{name: figure[whole] for name, figure in ended.items()})
+        if not self.rising:
+            return self.hardest(len(level))
+        return next_level(level, success, whole & ~success & failed, self.last, generator)

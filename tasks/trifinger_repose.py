@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from tasks.base import Edit, Entry, Task, check_timestep, register
-from tasks.curriculum import Averages, levels, next_level
+from tasks.curriculum import Curriculum
 from tasks.draws import Range, check_range, draws, uniform
 from tasks.rotations import matrix_of
 from tasks.state import State
@@ -121,10 +121,11 @@ class TrifingerRepose(Task):
         self.radius = checks.real("radius", radius, above=0.0, high=ARENA)
         if weak_finger is not None:
             weak_finger = checks.whole("weak_finger", weak_finger, 0, 2)
-        self.curriculum = checks.flag("curriculum", curriculum)
         self.cube_mass = check_range("cube_mass", cube_mass, above=0.0)
         self.friction = check_range("friction", friction, above=0.0)
         self.oriented = difficulty == 4 or yaw is not None
+        figures = ("success", "error", "level", *["angle"] * self.oriented)
+        self.curriculum = Curriculum(LAST_LEVEL, *figures, rising=curriculum)
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
         edit = _edit(check_timestep(physics_timestep), weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
@@ -134,7 +135,6 @@ class TrifingerRepose(Task):
         self._turn = torch.stack([turns.cos(), turns.sin()])
         signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
         self._corners = torch.cartesian_prod(signs, signs, signs)
-        self.averages = Averages("success", "error", "level", *["angle"] * self.oriented)
 
     def layout(self) -> tuple[Entry, ...]:
         """Joints, cube, goal, last action."""
@@ -160,29 +160,28 @@ class TrifingerRepose(Task):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
-        return self._start(levels(n, LAST_LEVEL), generator)
+        return self._start(self.curriculum.hardest(n), generator)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """All goals; the first level, or with ``curriculum=False`` the last."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        return self.mapped_at_random(self._start(level, generator), generator)
+        return self.mapped_at_random(self._start(self.curriculum.start(n), generator), generator)
 
     def restart(self, finished: State, generator: torch.Generator | None) -> State:
         """Judge whole episodes: the next one reaches farther out after success, less far after failure."""
-        level = finished.variables["level"][:, 0]
-        whole = finished.time > self.episode_seconds - self.control_timestep / 2
-        whole |= self.terminated(finished)
-        success, error = whole & self.success(finished), self.position_error(finished)
-        ended = {"success": success, "error": error, "level": level}
-        far = error > FAILURE_DISTANCE
+        over = finished.time > self.episode_seconds - self.control_timestep / 2
+        figures = {"error": self.position_error(finished)}
+        far = figures["error"] > FAILURE_DISTANCE
         if self.oriented:
-            ended["angle"] = self.orientation_error(finished)
-            far |= ended["angle"] > FAILURE_ANGLE
-        self.averages.update(**{name: figure[whole] for name, figure in ended.items()})
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        failure = whole & ~success & far
-        level = next_level(level, success, failure, LAST_LEVEL, generator)
+            figures["angle"] = self.orientation_error(finished)
+            far |= figures["angle"] > FAILURE_ANGLE
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=over | self.terminated(finished),
+            success=self.success(finished),
+            failed=far,
+            generator=generator,
+            **figures,
+        )
         return self.mapped_at_random(self._start(level, generator), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None) -> State:
@@ -337,15 +336,15 @@ class TrifingerRepose(Task):
 
     def metrics(self) -> dict[str, float]:
         """Success rate, final errors (m, rad) and level, means of about the last 500 episodes."""
-        return dict(self.averages.values)
+        return dict(self.curriculum.averages.values)
 
     def state_dict(self) -> dict[str, Any]:
         """The averages that :meth:`metrics` reports."""
-        return dict(self.averages.values)
+        return dict(self.curriculum.averages.values)
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.load(saved)
+        self.curriculum.averages.load(saved)
 
 
 def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:

@@ -263,6 +263,13 @@ SUBJECTS = [
         ),
     ),
     subject(
+        "Curriculum",
+        lambda last, names, rising: curriculum.Curriculum(last, *names, rising=rising),
+        last=count(7),
+        names=Argument(["success", "level"], {"twice": ["a", "a"], "numbers": [1, 2], "none": []}),
+        rising=flag(False),
+    ),
+    subject(
         "update",
         lambda values: curriculum.Averages("success").update(**values),
         values=Argument(
