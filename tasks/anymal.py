@@ -14,8 +14,9 @@ import mujoco
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_timestep
+from tasks.base import Edit, Task, check_timestep
 from tasks.draws import Range, check_range, draws, uniform
+from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation, checks
@@ -29,8 +30,6 @@ DEFAULT_POSE = (0.0, 0.4, -0.8, 0.0, 0.4, -0.8, 0.0, -0.4, 0.8, 0.0, -0.4, 0.8)
 ACTION_RANGE = 2.0
 # What observations are multiplied by (legged_gym); the last action is seen in steps of 0.5 rad.
 LINEAR_SCALE, ANGULAR_SCALE, JOINT_VELOCITY_SCALE, ACTION_SCALE = 2.0, 0.25, 0.05, 4.0
-# Observations beyond it are cut off: a robot that tumbles must not blow up the networks.
-OBSERVATION_LIMIT = 20.0
 FOOT_RADIUS = 0.03
 # A foot this close to the ground counts as standing on it, m.
 TOUCH_DISTANCE = 0.01
@@ -64,7 +63,7 @@ class Anymal(Task):
     """
 
     control_timestep = 0.02
-    action_size = 12
+    observation_limit = 20.0  # a robot that tumbles must not blow up the networks
     max_velocity = 100.0
 
     def __init__(
@@ -98,14 +97,33 @@ class Anymal(Task):
         group, robot = self.robot.group, self.robot
         joints = robot.joints(JOINTS)
         by_joint = "permutation and signs of the joints"
+
+        def velocity(state: State) -> Tensor:
+            return into_base(rotation(state), state.qvel[:, 0:3])
+
         return (
-            Entry("linear velocity", polar(group), "m/s", "base", "polar vector", LINEAR_SCALE),
-            Entry("angular velocity", axial(group), "rad/s", "base", "axial vector", ANGULAR_SCALE),
-            Entry("direction of gravity", polar(group), "1", "base", "polar vector"),
-            Entry("joint positions from the standing pose", joints, "rad", "joints", by_joint),
-            Entry("joint velocities", joints, "rad/s", "joints", by_joint, JOINT_VELOCITY_SCALE),
-            Entry("last action", robot.actuators, "2 rad", "joints", by_joint, ACTION_SCALE),
-        )
+            Entry("linear velocity", velocity, polar(group), "m/s", "base", "polar vector", LINEAR_SCALE),
+            Entry(
+                "angular velocity", lambda state: state.qvel[:, 3:6],
+                axial(group), "rad/s", "base", "axial vector", ANGULAR_SCALE,
+            ),
+            Entry(
+                "direction of gravity", lambda state: -rotation(state)[:, 2],
+                polar(group), "1", "base", "polar vector",
+            ),
+            Entry(
+                "joint positions from the standing pose", lambda state: state.qpos[:, 7:19] - self._pose,
+                joints, "rad", "joints", by_joint,
+            ),
+            Entry(
+                "joint velocities", lambda state: state.qvel[:, 6:18],
+                joints, "rad/s", "joints", by_joint, JOINT_VELOCITY_SCALE,
+            ),
+            Entry(
+                "last action", lambda state: state.variables["last_action"],
+                robot.actuators, "2 rad", "joints", by_joint, ACTION_SCALE,
+            ),
+        )  # fmt: skip
 
     def variables(self) -> dict[str, Representation]:
         """Last action, joint velocities one step ago, time in the air of every foot, curriculum level."""
@@ -157,19 +175,6 @@ class Anymal(Task):
             "last_velocity": state.qvel[:, 6:18],
             "air_time": air,
         }
-
-    def observe_robot(self, state: State, observation: Tensor) -> None:
-        """Write the 45 proprioceptive numbers into the first columns of ``(n, 45 or more)``."""
-        turn = rotation(state)
-        parts = (
-            into_base(turn, state.qvel[:, 0:3]) * LINEAR_SCALE,
-            state.qvel[:, 3:6] * ANGULAR_SCALE,
-            -turn[:, 2],
-            state.qpos[:, 7:19] - self._pose,
-            state.qvel[:, 6:18] * JOINT_VELOCITY_SCALE,
-            state.variables["last_action"] * ACTION_SCALE,
-        )
-        torch.cat([part.float() for part in parts], dim=1, out=observation[:, :45])
 
     def feet_in_base(self, joints: Tensor) -> Tensor:
         """Centres of the feet in the base frame, ``(n, 12)`` joint angles to ``(n, 4, 3)``, m."""

@@ -15,10 +15,11 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
-from tasks.base import Entry, register
+from tasks.anymal import Anymal, into_base, rotation
+from tasks.base import register
 from tasks.curriculum import Curriculum
 from tasks.draws import draws
+from tasks.observation import Entry
 from tasks.state import State
 from torchrl_sym import checks
 from torchrl_sym.representations import heading, height_map, invariant, polar
@@ -81,7 +82,6 @@ class AnymalClimb(Anymal):
     name = "anymal_climb"
     asset = "anymal_climb.xml"
     episode_seconds = 6.0
-    observation_size = 282
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
@@ -99,13 +99,25 @@ class AnymalClimb(Anymal):
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, command, height map."""
         group = self.robot.group
+
+        def target(state: State) -> Tensor:
+            return into_base(rotation(state), self._gap(state))
+
+        def time_left(state: State) -> Tensor:
+            return 1 - state.time[:, None] / self.episode_seconds
+
+        def heights(state: State) -> Tensor:  # below a standing robot's base
+            level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
+            return (self.heights(state) - level).clamp_(-1.0, 1.0)
+
+        turned = "sine changes sign in a mirror"
         return (
             *self.proprioception(),
-            Entry("target position", polar(group), "m", "base", "polar vector", TARGET_SCALE),
-            Entry("heading error (cos, sin)", heading(group), "1", "base", "sine changes sign in a mirror"),
-            Entry("time left", invariant(group, 1), "1", "-", "invariant"),
+            Entry("target position", target, polar(group), "m", "base", "polar vector", TARGET_SCALE),
+            Entry("heading error (cos, sin)", self._heading_error, heading(group), "1", "base", turned),
+            Entry("time left", time_left, invariant(group, 1), "1", "-", "invariant"),
             Entry(
-                "heights of the ground", height_map(group, *_axes()), "m", "heading",
+                "heights of the ground", heights, height_map(group, *_axes()), "m", "heading",
                 "permutation of the grid's points", HEIGHT_SCALE,
             ),
         )  # fmt: skip
@@ -158,20 +170,18 @@ class AnymalClimb(Anymal):
         state.variables["level"] = level[:, None].clone()
         height = LOWEST_BOX + (self.height - LOWEST_BOX) * level / LAST_LEVEL
         height = height * (1 - vary * u[:, 3])
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        box, target = state.mocap_pos[:, 0], state.mocap_pos[:, 1]
+        box, target = state.mocap_place(0), state.mocap_place(1)
         box[:, 0] = BOX_DISTANCE[0] + (BOX_DISTANCE[1] - BOX_DISTANCE[0]) * u[:, 1]
         box[:, 1] = BOX_OFFSET * u[:, 2]
         box[:, 2] = height - BOX
         target[:] = box
         target[:, 2] = height + TARGET_HEIGHT
-        state.mocap_quat[:, 1] = state.qpos[:, 3:7]
+        state.mocap_turn(1)[:] = state.qpos[:, 3:7]
         return state
 
     def ground(self, state: State, points: Tensor) -> Tensor:
         """Height of the box where it is, else zero."""
-        assert state.mocap_pos is not None
-        box = state.mocap_pos[:, 0].to(points.dtype)
+        box = state.mocap_place(0).to(points.dtype)
         gap = (points[..., :2] - box[:, None, :2]).abs_()
         return (gap <= BOX).all(dim=-1) * (box[:, None, 2] + BOX)
 
@@ -179,10 +189,9 @@ class AnymalClimb(Anymal):
         """Height of the ground at the points of the map, ``(n, 231)`` float32, m, in the world frame."""
 
         def compute() -> Tensor:
-            assert state.mocap_pos is not None
             ahead = self._ahead(state)
             cos, sin = ahead.float().unsqueeze(-1).unbind(1)
-            box = state.mocap_pos[:, 0]
+            box = state.mocap_place(0)
             offset = (state.qpos[:, 0:2] - box[:, :2]).float()
             x = torch.addcmul(offset[:, :1], cos, self._grid_x).addcmul_(sin, self._grid_y, value=-1)
             y = torch.addcmul(offset[:, 1:], sin, self._grid_x).addcmul_(cos, self._grid_y)
@@ -202,15 +211,13 @@ class AnymalClimb(Anymal):
 
     def _heading_error(self, state: State) -> Tensor:
         """(cos, sin) of the turn from the robot's heading to the one asked for, ``(n, 2)``."""
-        assert state.mocap_quat is not None
-        w, z = state.mocap_quat[:, 1, 0], state.mocap_quat[:, 1, 3]
+        w, _, _, z = state.mocap_turn(1).unbind(-1)
         cos, sin = w * w - z * z, 2 * w * z
         x, y = self._ahead(state).unbind(-1)
         return torch.stack([cos * x + sin * y, sin * x - cos * y], dim=-1)
 
     def _gap(self, state: State) -> Tensor:
-        assert state.mocap_pos is not None
-        return state.mocap_pos[:, 1] - state.qpos[:, 0:3]
+        return state.mocap_place(1) - state.qpos[:, 0:3]
 
     def _distance(self, state: State) -> Tensor:
         """Horizontal distance of base and target, ``(n,)``, m."""
@@ -218,19 +225,6 @@ class AnymalClimb(Anymal):
 
     def _over(self, state: State) -> Tensor:
         return state.time > self.episode_seconds - self.control_timestep / 2
-
-    def observe(self, state: State) -> Tensor:
-        """Proprioception, command, and the heights below a standing robot's base."""
-        observation = torch.empty(len(state), 282)
-        self.observe_robot(state, observation)
-        observation[:, 45:48] = into_base(rotation(state), self._gap(state)) * TARGET_SCALE
-        observation[:, 48:50] = self._heading_error(state)
-        observation[:, 50] = 1 - state.time / self.episode_seconds
-        observation[:, :51].clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-        level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
-        heights = torch.sub(self.heights(state), level, out=observation[:, 51:])
-        heights.clamp_(-1.0, 1.0).mul_(HEIGHT_SCALE)
-        return observation
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Be on the box at the end; in phase A also walk towards it; walk well."""
@@ -265,8 +259,7 @@ class AnymalClimb(Anymal):
 
     def success(self, state: State) -> Tensor:
         """The robot stands on the box, near its centre."""
-        assert state.mocap_pos is not None
-        above = state.qpos[:, 2] - (state.mocap_pos[:, 0, 2] + BOX) > SUCCESS_HEIGHT
+        above = state.qpos[:, 2] - (state.mocap_place(0)[:, 2] + BOX) > SUCCESS_HEIGHT
         return above & (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
 
     def metrics(self) -> dict[str, float]:

@@ -13,10 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
-from tasks.base import Entry, register
+from tasks.anymal import Anymal, into_base, rotation
+from tasks.base import register
 from tasks.curriculum import Curriculum
 from tasks.draws import draws
+from tasks.observation import Entry
 from tasks.state import State
 from torchrl_sym import Representation, checks
 from torchrl_sym.representations import invariant, polar
@@ -81,7 +82,6 @@ class AnymalPush(Anymal):
     name = "anymal_push"
     asset = "anymal_push.xml"
     episode_seconds = 7.0
-    observation_size = 51
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
@@ -92,10 +92,17 @@ class AnymalPush(Anymal):
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, then where the cube is, and where it has to go."""
         position = polar(self.robot.group)
+
+        def cube(state: State) -> Tensor:
+            return into_base(rotation(state), state.qpos[:, 19:22] - state.qpos[:, 0:3])
+
+        def gap(state: State) -> Tensor:
+            return into_base(rotation(state), state.mocap_place(0) - state.qpos[:, 19:22])
+
         return (
             *self.proprioception(),
-            Entry("cube position", position, "m", "base", "polar vector", CUBE_SCALE),
-            Entry("from cube to target", position, "m", "base", "polar vector", GAP_SCALE),
+            Entry("cube position", cube, position, "m", "base", "polar vector", CUBE_SCALE),
+            Entry("from cube to target", gap, position, "m", "base", "polar vector", GAP_SCALE),
         )
 
     def variables(self) -> dict[str, Representation]:
@@ -149,9 +156,9 @@ class AnymalPush(Anymal):
         turn = bearing + (2 * u[:, 3] - 1) * CUBE_TURN
         state.qpos[:, 22], state.qpos[:, 25] = (turn / 2).cos(), (turn / 2).sin()
         reach = NEAREST_TARGET + TARGET_STEP * level * (spread + (1 - spread) * u[:, 4])
-        assert state.mocap_pos is not None
-        state.mocap_pos[:, 0, :2] = (distance + reach)[:, None] * ray
-        state.mocap_pos[:, 0, 2] = CUBE
+        target = state.mocap_place(0)
+        target[:, :2] = (distance + reach)[:, None] * ray
+        target[:, 2] = CUBE
         state.variables["distance"] = reach[:, None].clone()
         state.variables["start_distance"] = reach[:, None].clone()
         return state
@@ -162,22 +169,10 @@ class AnymalPush(Anymal):
 
     def _gap(self, state: State) -> Tensor:
         """From the cube to the target, horizontally, ``(n, 2)``, m."""
-        assert state.mocap_pos is not None
-        return state.mocap_pos[:, 0, :2] - state.qpos[:, 19:21]
+        return state.mocap_place(0)[:, :2] - state.qpos[:, 19:21]
 
     def _distance(self, state: State) -> Tensor:
         return state.shared("distance", lambda: self._gap(state).norm(dim=-1))
-
-    def observe(self, state: State) -> Tensor:
-        """Proprioception, cube, and from there to the target, in the base frame."""
-        assert state.mocap_pos is not None
-        observation = torch.empty(len(state), 51)
-        self.observe_robot(state, observation)
-        turn, base = rotation(state), state.qpos[:, 0:3]
-        cube = state.qpos[:, 19:22]
-        observation[:, 45:48] = into_base(turn, cube - base) * CUBE_SCALE
-        observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - cube) * GAP_SCALE
-        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Approach the cube from behind, move it to the target, hold it there; walk well."""

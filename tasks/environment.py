@@ -87,11 +87,11 @@ class BatchedEnv(EnvBase):
         self.num_diverged = 0
         self._generator = Generator()
         self._make_specs()
-        self._check_task()
         self._substeps = task.substeps
         # Time adds up rounding errors; half a control step is far above them.
         self._time_limit = (task.max_steps - 0.5) * task.control_timestep
         start = task.sample_initial_state(1, torch.Generator().manual_seed(0))
+        self._check_task(start)
         variables = {name: x.new_zeros(num_envs, *x.shape[1:]) for name, x in start.variables.items()}
         self._state = self._state_with(variables)
         self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
@@ -140,7 +140,7 @@ class BatchedEnv(EnvBase):
         self.reward_spec = Unbounded(torch.Size((n, 1)), **real)
         self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
 
-    def _check_task(self) -> None:
+    def _check_task(self, start: State) -> None:
         """Sizes, boxes and goals agree with the symmetry: better now than after a night's training."""
         group, names = self.task.symmetry.group, self.task.goal_names
         if len(names) != group.order:
@@ -149,6 +149,7 @@ class BatchedEnv(EnvBase):
                 f"correct goal_names of task {self.task.name!r}"
             )
         self.task.symmetry.check_specs(self)
+        self.task.check_observation(start)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:

@@ -70,6 +70,18 @@ class State:
             ):
                 raise ValueError(f"variable {name!r}: expected {n} rows by name, got {checks.shown(value)}")
 
+    def mocap_place(self, body: int) -> Tensor:
+        """Position of a mocap body, by its number, ``(n, 3)``, m; the live tensor.
+
+        Raises:
+            ValueError: the state says nothing of mocap bodies.
+        """
+        return _given("mocap_pos", self.mocap_pos)[:, body]
+
+    def mocap_turn(self, body: int) -> Tensor:
+        """Orientation of a mocap body, by its number, ``(n, 4)``; see :meth:`mocap_place`."""
+        return _given("mocap_quat", self.mocap_quat)[:, body]
+
     def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """A quantity that reward, termination and observation of one step all need.
 
@@ -116,6 +128,12 @@ class State:
             time=function(self.time),
             variables={name: function(x) for name, x in self.variables.items()},
         )
+
+
+def _given(name: str, value: Tensor | None) -> Tensor:
+    if value is None:
+        raise ValueError(f"expected a state with {name}, which this task reads, got None; take env.state")
+    return value
 
 
 def _rows(name: str, value: Tensor, ndim: int, n: int | None = None, last: int | None = None) -> int:

@@ -18,9 +18,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_timestep, register
+from tasks.base import Edit, Task, check_timestep, register
 from tasks.curriculum import Curriculum
 from tasks.draws import Range, check_range, draws, uniform
+from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation, checks
@@ -32,7 +33,6 @@ JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "
 START_NOISE = 0.1
 # What observations are multiplied by: a fingertip's m and rad/s are far from 1.
 JOINT_VELOCITY_SCALE, POSITION_SCALE = 0.1, 10.0
-OBSERVATION_LIMIT = 20.0
 CUBE = 0.0325  # half its edge, m
 CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
@@ -91,11 +91,10 @@ class TrifingerRepose(Task):
     name = "trifinger_repose"
     asset = "trifinger_repose.xml"
     control_timestep = 0.02
-    observation_size = 41
-    action_size = 9
     goal_names = ("right", "back left", "front left")
     task_terms = ("keypoints",)
     carried = ("cube", "goal")
+    observation_limit = 20.0
     max_velocity = 200.0
 
     def __init__(
@@ -141,16 +140,38 @@ class TrifingerRepose(Task):
         group, robot = self.robot.group, self.robot
         joints, position, orientation = robot.joints(JOINTS), polar(group), quaternion(group)
         by_finger, lift = "permutation of the fingers", "quaternion, multiplied from the left"
-        speed = JOINT_VELOCITY_SCALE
+
+        def goal_orientation(state: State) -> Tensor:
+            goal = state.mocap_turn(0)
+            return goal if self.oriented else torch.zeros_like(goal)
+
         return (
-            Entry("joint positions from the starting pose", joints, "rad", "joints", by_finger),
-            Entry("joint velocities", joints, "rad/s", "joints", by_finger, speed),
-            Entry("cube position", position, "m", "world", "polar vector", POSITION_SCALE),
-            Entry("cube orientation", orientation, "1", "world", lift),
-            Entry("goal position", position, "m", "world", "polar vector", POSITION_SCALE),
-            Entry("goal orientation, zeros if it has none", orientation, "1", "world", lift),
-            Entry("last action", robot.actuators, "0.36 N m", "joints", by_finger),
-        )
+            Entry(
+                "joint positions from the starting pose",
+                lambda state: state.qpos[:, :9] - self._start_pose,
+                joints, "rad", "joints", by_finger,
+            ),
+            Entry(
+                "joint velocities", lambda state: state.qvel[:, :9],
+                joints, "rad/s", "joints", by_finger, JOINT_VELOCITY_SCALE,
+            ),
+            Entry(
+                "cube position", lambda state: state.qpos[:, 9:12],
+                position, "m", "world", "polar vector", POSITION_SCALE,
+            ),
+            Entry("cube orientation", lambda state: state.qpos[:, 12:16], orientation, "1", "world", lift),
+            Entry(
+                "goal position", lambda state: state.mocap_place(0),
+                position, "m", "world", "polar vector", POSITION_SCALE,
+            ),
+            Entry(
+                "goal orientation, zeros if it has none", goal_orientation, orientation, "1", "world", lift
+            ),
+            Entry(
+                "last action", lambda state: state.variables["last_action"],
+                robot.actuators, "0.36 N m", "joints", by_finger,
+            ),
+        )  # fmt: skip
 
     def variables(self) -> dict[str, Representation]:
         """Last action, distance of each fingertip from the cube one step ago, m, curriculum level."""
@@ -245,20 +266,6 @@ class TrifingerRepose(Task):
         """Remember the action and the distances of the fingertips."""
         return {"last_action": action.double().clamp(-1.0, 1.0), "tip_distance": self.tip_distance(state)}
 
-    def observe(self, state: State) -> Tensor:
-        """Joints, cube, goal, last action."""
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        observation = torch.zeros(len(state), 41)
-        observation[:, 0:9] = state.qpos[:, :9] - self._start_pose
-        observation[:, 9:18] = state.qvel[:, :9] * JOINT_VELOCITY_SCALE
-        observation[:, 18:21] = state.qpos[:, 9:12] * POSITION_SCALE
-        observation[:, 21:25] = state.qpos[:, 12:16]
-        observation[:, 25:28] = state.mocap_pos[:, 0] * POSITION_SCALE
-        if self.oriented:
-            observation[:, 28:32] = state.mocap_quat[:, 0]
-        observation[:, 32:41] = state.variables["last_action"]
-        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-
     def fingertips(self, state: State) -> tuple[Tensor, Tensor]:
         """Centres of the fingertips, ``(n, 3, 3)``, m, and squares of their speeds, ``(n, 3)``, m^2/s^2.
 
@@ -290,23 +297,20 @@ class TrifingerRepose(Task):
 
     def position_error(self, state: State) -> Tensor:
         """Distance of the cube from its goal, ``(n,)``, m."""
-        assert state.mocap_pos is not None
-        goal = state.mocap_pos[:, 0]
+        goal = state.mocap_place(0)
         return state.shared("position_error", lambda: (state.qpos[:, 9:12] - goal).norm(dim=-1))
 
     def orientation_error(self, state: State) -> Tensor:
         """Angle between cube and goal, ``(n,)``, rad; the same for both signs of a quaternion."""
-        assert state.mocap_quat is not None
-        product = (state.qpos[:, 12:16] * state.mocap_quat[:, 0]).sum(dim=-1).abs()
+        product = (state.qpos[:, 12:16] * state.mocap_turn(0)).sum(dim=-1).abs()
         return 2 * product.clamp(max=1.0).acos()
 
     def _keypoint_distance(self, state: State) -> Tensor:
         """Distance of the cube's corners from the goal's, ``(n, 8)``, m; or of the centres, ``(n, 1)``."""
         if not self.oriented:  # then all corners are off by the same
             return self.position_error(state)[:, None]
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_quat[:, 0])
-        offset = state.qpos[:, 9:12] - state.mocap_pos[:, 0]
+        turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_turn(0))
+        offset = state.qpos[:, 9:12] - state.mocap_place(0)
         return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import tasks
-from tasks import base, curriculum, draws, paths, rendering, state, suite
+from tasks import base, curriculum, draws, observation, paths, rendering, state, suite
 from tests.malformed import (
     Argument,
     array,
@@ -174,13 +174,23 @@ SUBJECTS = [
     ),
     subject(
         "Entry",
-        base.Entry,
+        observation.Entry,
         name=choice("velocity").but("misspelt", "other case", "empty"),
+        value=function(lambda state: state.qvel),
         representation=thing(r.polar(CARTPOLE.symmetry.group), builder=r.polar),
         unit=Argument("m", {"None": None, "a number": 3}),
         frame=Argument("base", {"None": None}),
         kind=Argument("polar", {"None": None}),
-        scale=number(2.0, low=-np.inf),
+        scale=number(1.0, low=-np.inf),
+        divisor=number(2.0, zero=0.0),
+    ),
+    subject(
+        "Observation",
+        observation.Observation,
+        entries=Argument(
+            CARTPOLE.layout(), {"None": None, "empty": [], "texts": ["a"], "a task": CARTPOLE}
+        ),
+        limit=optional(number(20.0, zero=0.0)),
     ),
     subject(
         "register",
