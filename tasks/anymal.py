@@ -11,10 +11,13 @@ functions of the state.
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import TypedDict  # unpacked in signatures since Python 3.11
 
 from tasks.base import Edit, Task, check_timestep
+from tasks.constants import Constant
 from tasks.draws import Range, check_range, draws, uniform
 from tasks.observation import Entry
 from tasks.rotations import matrix_of
@@ -30,17 +33,20 @@ DEFAULT_POSE = (0.0, 0.4, -0.8, 0.0, 0.4, -0.8, 0.0, -0.4, 0.8, 0.0, -0.4, 0.8)
 ACTION_RANGE = 2.0
 # What observations are multiplied by (legged_gym); the last action is seen in steps of 0.5 rad.
 LINEAR_SCALE, ANGULAR_SCALE, JOINT_VELOCITY_SCALE, ACTION_SCALE = 2.0, 0.25, 0.05, 4.0
-FOOT_RADIUS = 0.03
 # A foot this close to the ground counts as standing on it, m.
 TOUCH_DISTANCE = 0.01
-# Kinematics of a leg, m: hip and thigh origins, knee below thigh, foot below knee (assets/README.md).
-_HIP, _THIGH, _KNEE, _FOOT = (
-    (0.2999, 0.104),
-    (0.0599, 0.08381),
-    (0.1003, -0.285),
-    (0.08795, 0.01305, -0.31547),
-)
-_SIDE_X, _SIDE_Y = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)
+
+
+class RobotArguments(TypedDict, total=False):
+    """Keyword arguments of :class:`Anymal`, for the signatures of tasks that hand them on."""
+
+    episode_seconds: float | None
+    physics_timestep: float
+    friction: Range | None
+    added_mass: Range | None
+    payload: float
+    payload_position: tuple[float, float, float]
+    weak_leg: str | None
 
 
 class Anymal(Task):
@@ -88,9 +94,23 @@ class Anymal(Task):
         super().__init__(PointGroup.klein_four(), episode_seconds=episode_seconds, edit=edit)
         self._mass = float(self.model.body("base").mass[0])
         self.added_mass = check_range("added_mass", added_mass, above=-self._mass)
-        self._pose = torch.tensor(DEFAULT_POSE, dtype=torch.float64)
-        self._side_x = torch.tensor(_SIDE_X, dtype=torch.float64)
-        self._side_y = torch.tensor(_SIDE_Y, dtype=torch.float64)
+        self._pose = Constant(DEFAULT_POSE)
+        self._read_legs()
+        self._read_drives()
+
+    def _read_legs(self) -> None:
+        """Where hip, thigh, knee and foot of every leg are in the part above them, m."""
+        model = self.model
+        parts = [[model.body(f"{leg}_{part}").pos for leg in LEGS] for part in ("hip", "thigh", "shank")]
+        parts.append([model.geom(f"{leg}_foot").pos for leg in LEGS])
+        self._legs = Constant(np.array(parts).transpose(0, 2, 1))  # (part, axis, leg)
+        self.foot_radius = float(model.geom(f"{LEGS[0]}_foot").size[0])
+
+    def _read_drives(self) -> None:
+        """Gains (N m/rad, N m s/rad) and largest torque (N m) of a joint; all joints have the same."""
+        drive, joint = self.model.actuator(JOINTS[0]), self.model.joint(JOINTS[0])
+        self._stiffness, self._damping = float(drive.gainprm[0]), -float(drive.biasprm[2])
+        self._torque = float(self.model.jnt_actfrcrange[joint.id, 1])
 
     def proprioception(self) -> tuple[Entry, ...]:
         """The first 45 numbers of every observation."""
@@ -112,7 +132,8 @@ class Anymal(Task):
                 polar(group), "1", "base", "polar vector",
             ),
             Entry(
-                "joint positions from the standing pose", lambda state: state.qpos[:, 7:19] - self._pose,
+                "joint positions from the standing pose",
+                lambda state: state.qpos[:, 7:19] - self._pose.like(state.qpos),
                 joints, "rad", "joints", by_joint,
             ),
             Entry(
@@ -146,9 +167,9 @@ class Anymal(Task):
         """
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         noise = draws(n, 12, generator) * 0.2 - 0.1
-        qpos[:, 7:19] = self._pose + noise
+        qpos[:, 7:19] = self._pose.like(noise) + noise
         qpos[:, 3], qpos[:, 6] = (yaw / 2).cos(), (yaw / 2).sin()
-        qpos[:, 2] = FOOT_RADIUS + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
+        qpos[:, 2] = self.foot_radius + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
         zeros = torch.zeros(n, 12, dtype=torch.float64)
         return State(
             qpos=qpos,
@@ -165,7 +186,8 @@ class Anymal(Task):
 
     def control(self, action: Tensor, state: State) -> Tensor:
         """Joint position targets, rad."""
-        return action.double().clamp(-1.0, 1.0) * ACTION_RANGE + self._pose
+        target = action.double().clamp(-1.0, 1.0) * ACTION_RANGE
+        return target + self._pose.like(target)
 
     def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Remember the action, the joint velocities, and how long each foot has been in the air."""
@@ -178,16 +200,15 @@ class Anymal(Task):
 
     def feet_in_base(self, joints: Tensor) -> Tensor:
         """Centres of the feet in the base frame, ``(n, 12)`` joint angles to ``(n, 4, 3)``, m."""
+        hip, thigh, knee, foot = self._legs.like(joints)  # (axis, leg) each
         q1, q2, q3 = joints.unflatten(-1, (4, 3)).unbind(-1)
         q23 = q2 + q3
-        fx, fz = _FOOT[0] * self._side_x, _FOOT[2]
         sin, cos = q23.sin(), q23.cos()
-        x = _KNEE[1] * q2.sin() + fx * cos + fz * sin + _THIGH[0] * self._side_x
-        z = _KNEE[1] * q2.cos() - fx * sin + fz * cos
-        y = (_THIGH[1] + _KNEE[0] + _FOOT[1]) * self._side_y
+        x = knee[2] * q2.sin() + foot[0] * cos + foot[2] * sin + thigh[0]
+        z = knee[2] * q2.cos() - foot[0] * sin + foot[2] * cos
+        y = thigh[1] + knee[1] + foot[1]
         sin, cos = q1.sin(), q1.cos()
-        foot = (x + _HIP[0] * self._side_x, y * cos - z * sin + _HIP[1] * self._side_y, y * sin + z * cos)
-        return torch.stack(foot, dim=-1)
+        return torch.stack([x + hip[0], y * cos - z * sin + hip[1], y * sin + z * cos], dim=-1)
 
     def feet(self, state: State) -> Tensor:
         """Centres of the feet in the world frame, ``(n, 4, 3)``, m."""
@@ -206,7 +227,7 @@ class Anymal(Task):
 
         def compute() -> Tensor:
             feet = self.feet(state)
-            return feet[..., 2] - self.ground(state, feet) < FOOT_RADIUS + TOUCH_DISTANCE
+            return feet[..., 2] - self.ground(state, feet) < self.foot_radius + TOUCH_DISTANCE
 
         return state.shared("touching", compute)
 
@@ -223,11 +244,12 @@ class Anymal(Task):
     def effort(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Regularisation: squares of torques, joint accelerations and changes of the action, ``(n,)``."""
         variables, velocity = state.variables, state.qvel[:, 6:18]
-        torque = 80.0 * (self.control(action, state) - state.qpos[:, 7:19]) - 2.0 * velocity
+        stretch = self.control(action, state) - state.qpos[:, 7:19]
+        torque = self._stiffness * stretch - self._damping * velocity
         acceleration = (velocity - variables["last_velocity"]) / self.control_timestep
         change = (action.double().clamp(-1.0, 1.0) - variables["last_action"]) * ACTION_RANGE
         return {
-            "torque": torque.clamp(-80.0, 80.0).square().sum(-1),
+            "torque": torque.clamp(-self._torque, self._torque).square().sum(-1),
             "acceleration": acceleration.square().sum(-1),
             "action_rate": change.square().sum(-1),
         }

@@ -14,8 +14,9 @@ from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack  # of typing since Python 3.11
 
-from tasks.anymal import Anymal, into_base, rotation
+from tasks.anymal import Anymal, RobotArguments, into_base, rotation
 from tasks.base import register
 from tasks.curriculum import Curriculum
 from tasks.draws import draws
@@ -24,7 +25,6 @@ from tasks.state import State
 from torchrl_sym import checks
 from torchrl_sym.representations import heading, height_map, invariant, polar
 
-BOX = 1.0  # half its edge, m; a cube sunk in the ground
 # Where the centre of the box is, m: ahead, and at most this far to the side.
 BOX_DISTANCE, BOX_OFFSET = (1.7, 2.0), 0.3
 TARGET_HEIGHT = 0.5  # of the target over the top of the box, m: the height of a standing robot
@@ -86,12 +86,18 @@ class AnymalClimb(Anymal):
     task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(
-        self, *, height: float = 0.3, phase: Phase = "A", curriculum: bool = True, **robot: Any
+        self,
+        *,
+        height: float = 0.3,
+        phase: Phase = "A",
+        curriculum: bool = True,
+        **robot: Unpack[RobotArguments],
     ) -> None:
         self.height = checks.real("height", height, LOWEST_BOX)
         self.phase = checks.one_of("phase", phase, PHASES)
         self.curriculum = Curriculum(LAST_LEVEL, "success", "level", "distance", rising=curriculum)
         super().__init__(**robot)
+        self.box = float(self.model.geom("box").size[0])  # half its edge, m; a cube sunk in the ground
         self._grid_x, self._grid_y = (grid.clone() for grid in torch.cartesian_prod(*_axes()).unbind(-1))
         footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
         self._below = footprint.nonzero().squeeze(1)
@@ -173,7 +179,7 @@ class AnymalClimb(Anymal):
         box, target = state.mocap_place(0), state.mocap_place(1)
         box[:, 0] = BOX_DISTANCE[0] + (BOX_DISTANCE[1] - BOX_DISTANCE[0]) * u[:, 1]
         box[:, 1] = BOX_OFFSET * u[:, 2]
-        box[:, 2] = height - BOX
+        box[:, 2] = height - self.box
         target[:] = box
         target[:, 2] = height + TARGET_HEIGHT
         state.mocap_turn(1)[:] = state.qpos[:, 3:7]
@@ -183,7 +189,7 @@ class AnymalClimb(Anymal):
         """Height of the box where it is, else zero."""
         box = state.mocap_place(0).to(points.dtype)
         gap = (points[..., :2] - box[:, None, :2]).abs_()
-        return (gap <= BOX).all(dim=-1) * (box[:, None, 2] + BOX)
+        return (gap <= self.box).all(dim=-1) * (box[:, None, 2] + self.box)
 
     def heights(self, state: State) -> Tensor:
         """Height of the ground at the points of the map, ``(n, 231)`` float32, m, in the world frame."""
@@ -195,8 +201,8 @@ class AnymalClimb(Anymal):
             offset = (state.qpos[:, 0:2] - box[:, :2]).float()
             x = torch.addcmul(offset[:, :1], cos, self._grid_x).addcmul_(sin, self._grid_y, value=-1)
             y = torch.addcmul(offset[:, 1:], sin, self._grid_x).addcmul_(cos, self._grid_y)
-            inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= BOX
-            return torch.mul(inside, (box[:, 2:] + BOX).float(), out=y)
+            inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= self.box
+            return torch.mul(inside, (box[:, 2:] + self.box).float(), out=y)
 
         return state.shared("heights", compute)
 
@@ -259,7 +265,7 @@ class AnymalClimb(Anymal):
 
     def success(self, state: State) -> Tensor:
         """The robot stands on the box, near its centre."""
-        above = state.qpos[:, 2] - (state.mocap_place(0)[:, 2] + BOX) > SUCCESS_HEIGHT
+        above = state.qpos[:, 2] - (state.mocap_place(0)[:, 2] + self.box) > SUCCESS_HEIGHT
         return above & (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
 
     def metrics(self) -> dict[str, float]:

@@ -12,8 +12,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack  # of typing since Python 3.11
 
-from tasks.anymal import Anymal, into_base, rotation
+from tasks.anymal import Anymal, RobotArguments, into_base, rotation
 from tasks.base import register
 from tasks.curriculum import Curriculum
 from tasks.draws import draws
@@ -22,7 +23,6 @@ from tasks.state import State
 from torchrl_sym import Representation, checks
 from torchrl_sym.representations import invariant, polar
 
-CUBE = 0.3  # half its edge, m
 # Where the cube starts: distance from the robot, m, and how far a face is turned from it, rad.
 CUBE_DISTANCE, CUBE_TURN = (1.0, 1.3), 0.3
 # How far behind the cube the target is, m: 0.3 + 0.15 level U(0.5, 1), at most 1.35 at the last level.
@@ -85,8 +85,9 @@ class AnymalPush(Anymal):
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
-    def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
+    def __init__(self, *, curriculum: bool = True, **robot: Unpack[RobotArguments]) -> None:
         super().__init__(**robot)
+        self.cube = float(self.model.geom("cube").size[0])  # half its edge, m
         self.curriculum = Curriculum(LAST_LEVEL, "success", "level", rising=curriculum)
 
     def layout(self) -> tuple[Entry, ...]:
@@ -152,13 +153,13 @@ class AnymalPush(Anymal):
         ray = torch.stack([bearing.cos(), bearing.sin()], dim=-1)
         distance = CUBE_DISTANCE[0] + (CUBE_DISTANCE[1] - CUBE_DISTANCE[0]) * u[:, 2]
         state.qpos[:, 19:21] = distance[:, None] * ray
-        state.qpos[:, 21] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        state.qpos[:, 21] = self.cube + 0.001  # exactly touching, rounding would decide which corners touch
         turn = bearing + (2 * u[:, 3] - 1) * CUBE_TURN
         state.qpos[:, 22], state.qpos[:, 25] = (turn / 2).cos(), (turn / 2).sin()
         reach = NEAREST_TARGET + TARGET_STEP * level * (spread + (1 - spread) * u[:, 4])
         target = state.mocap_place(0)
         target[:, :2] = (distance + reach)[:, None] * ray
-        target[:, 2] = CUBE
+        target[:, 2] = self.cube
         state.variables["distance"] = reach[:, None].clone()
         state.variables["start_distance"] = reach[:, None].clone()
         return state

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from tasks.base import Edit, Task, check_timestep, register
+from tasks.constants import Constant
 from tasks.curriculum import Curriculum
 from tasks.draws import Range, check_range, draws, uniform
 from tasks.observation import Entry
@@ -33,8 +34,6 @@ JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "
 START_NOISE = 0.1
 # What observations are multiplied by: a fingertip's m and rad/s are far from 1.
 JOINT_VELOCITY_SCALE, POSITION_SCALE = 0.1, 10.0
-CUBE = 0.0325  # half its edge, m
-CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
 # Share of that radius which starts and goals are drawn from at the first level; it grows to 1 at the last.
 FIRST_SHARE, LAST_LEVEL = 0.4, 7
@@ -49,8 +48,6 @@ OUTSIDE = 0.30
 KERNEL = 30.0
 # Weights, per step. The first two are a hundredth of IsaacGymEnvs', the price of speed a thousandth.
 WEIGHTS = {"keypoints": 0.4, "approach": 2.5, "speed": -5e-4, "torque": -5e-4, "action_rate": -5e-4}
-# Kinematics of a finger, m: offset of the tip from the swing axis, lift axis along it, links, height.
-_SIDE, _AXIS, _LINK, _HEIGHT = 0.086, 0.0505, 0.16, 0.29
 
 
 @register
@@ -128,12 +125,22 @@ class TrifingerRepose(Task):
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
         edit = _edit(check_timestep(physics_timestep), weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
-        self._start_pose = torch.from_numpy(self.model.qpos0[:9].copy())
+        self._start_pose = Constant(self.model.qpos0[:9])
         self._torque = float(self.model.actuator_ctrlrange[0, 1])  # the same for all
         turns = -torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
-        self._turn = torch.stack([turns.cos(), turns.sin()])
-        signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
-        self._corners = torch.cartesian_prod(signs, signs, signs)
+        self._turn = Constant(torch.stack([turns.cos(), turns.sin()]))
+        self._read_finger()
+        self.cube = float(self.model.geom("cube").size[0])  # half its edge, m
+        signs = torch.tensor([-self.cube, self.cube], dtype=torch.float64)
+        self._corners = Constant(torch.cartesian_prod(signs, signs, signs))
+
+    def _read_finger(self) -> None:
+        """Kinematics, m: offset of the tip from the swing axis, lift axis along it, links, height."""
+        upper, middle, lower = (self.model.body(f"{part}0").pos for part in ("upper", "middle", "lower"))
+        tip = self.model.site("tip0").pos
+        # a sum of lengths given in hundredths of a millimetre, without the rounding of sums
+        self._side = round(float(middle[0] + lower[0] + tip[0]), 9)
+        self._axis, self._link, self._height = float(middle[1]), -float(lower[2]), float(upper[2])
 
     def layout(self) -> tuple[Entry, ...]:
         """Joints, cube, goal, last action."""
@@ -148,7 +155,7 @@ class TrifingerRepose(Task):
         return (
             Entry(
                 "joint positions from the starting pose",
-                lambda state: state.qpos[:, :9] - self._start_pose,
+                lambda state: state.qpos[:, :9] - self._start_pose.like(state.qpos),
                 joints, "rad", "joints", by_finger,
             ),
             Entry(
@@ -210,14 +217,14 @@ class TrifingerRepose(Task):
         radius = self.radius * (FIRST_SHARE + (1 - FIRST_SHARE) * level / LAST_LEVEL)
         u = draws(n, 17, generator)
         qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
-        qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
+        qpos[:, :9] = self._start_pose.like(qpos) + (2 * u[:, :9] - 1) * START_NOISE
         anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)
         qpos[:, 9:11] = _place(radius, right if self.difficulty == 2 else anywhere, u[:, 11])
-        qpos[:, 11] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        qpos[:, 11] = self.cube + 0.001  # exactly touching, rounding would decide which corners touch
         half = u[:, 12] * (2 * math.pi)  # half the yaw: over a whole turn, both signs of the quaternion
         qpos[:, 12], qpos[:, 15] = half.cos(), half.sin()
         goal = torch.zeros(n, 1, 3, dtype=torch.float64)
-        goal[:, 0, 2] = self._height(u[:, 14])
+        goal[:, 0, 2] = self._goal_height(u[:, 14])
         if self.difficulty != 2:
             goal[:, 0, :2] = _place(radius, right, u[:, 13])
         orientation = qpos[:, 12:16].clone()  # shown where the goal has none
@@ -240,10 +247,10 @@ class TrifingerRepose(Task):
         state.variables["tip_distance"] = self.tip_distance(state)
         return state
 
-    def _height(self, u: Tensor) -> Tensor:
+    def _goal_height(self, u: Tensor) -> Tensor:
         if self.difficulty <= 2:
-            return torch.full_like(u, CUBE if self.difficulty == 1 else LIFT)
-        lowest = CUBE if self.difficulty == 3 else CUBE_DIAGONAL
+            return torch.full_like(u, self.cube if self.difficulty == 1 else LIFT)
+        lowest = self.cube if self.difficulty == 3 else math.sqrt(3) * self.cube
         return lowest + (HIGHEST - lowest) * u
 
     def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
@@ -275,16 +282,16 @@ class TrifingerRepose(Task):
         w0, w1, w2 = state.qvel[:, :9].unflatten(-1, (3, 3)).unbind(-1)
         q12, w12 = q1 + q2, w1 + w2
         sin1, cos1, sin12, cos12 = q1.sin(), q1.cos(), q12.sin(), q12.cos()
-        along = _AXIS + _LINK * (sin1 + sin12)  # the swing axis
-        down = -_LINK * (cos1 + cos12)
+        along = self._axis + self._link * (sin1 + sin12)  # the swing axis
+        down = -self._link * (cos1 + cos12)
         sin0, cos0 = q0.sin(), q0.cos()
-        across, height = _SIDE * cos0 + down * sin0, _HEIGHT - _SIDE * sin0 + down * cos0
-        cos, sin = self._turn
+        across, height = self._side * cos0 + down * sin0, self._height - self._side * sin0 + down * cos0
+        cos, sin = self._turn.like(q0)
         tips = torch.stack([across * cos - along * sin, across * sin + along * cos, height], dim=-1)
-        speed_along = _LINK * (cos1 * w1 + cos12 * w12)
-        speed_down = _LINK * (sin1 * w1 + sin12 * w12)
+        speed_along = self._link * (cos1 * w1 + cos12 * w12)
+        speed_down = self._link * (sin1 * w1 + sin12 * w12)
         # In the plane that swings: the tip turns about the axis and moves down.
-        square = speed_along.square() + (down * w0).square() + (speed_down - _SIDE * w0).square()
+        square = speed_along.square() + (down * w0).square() + (speed_down - self._side * w0).square()
         return tips, square
 
     def tip_distance(self, state: State) -> Tensor:
@@ -311,7 +318,7 @@ class TrifingerRepose(Task):
             return self.position_error(state)[:, None]
         turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_turn(0))
         offset = state.qpos[:, 9:12] - state.mocap_place(0)
-        return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
+        return (self._corners.like(turn) @ turn.mT + offset[:, None]).norm(dim=-1)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Bring the corners to their goals, the fingertips to the cube, gently."""

@@ -6,14 +6,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tasks.anymal_climb import BOX, AnymalClimb
 from tasks.anymal_climb import LAST_LEVEL as LAST_BOX
+from tasks.anymal_climb import AnymalClimb
 from tasks.anymal_push import LAST_LEVEL as LAST_TARGET
 from tasks.anymal_push import AnymalPush
 from tasks.curriculum import EPISODE_WEIGHT, Averages, Curriculum, next_level
 from tasks.environment import BatchedEnv
 from tasks.trifinger_repose import TrifingerRepose
 from tests.task_helpers import actions, assert_same, make, play
+
+BOX = 1.0  # half the edge of the box to climb, m
 
 
 def generator(seed=0):

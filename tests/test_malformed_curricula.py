@@ -1,12 +1,13 @@
-"""Malformed entries of observations, curricula and what tasks saved of them are refused."""
+"""Malformed entries of observations, constants, curricula and what tasks saved of them are refused."""
 
 import numpy as np
 import torch
 
 import tasks
-from tasks import base, curriculum, observation
+from tasks import base, constants, curriculum, observation
 from tests.malformed import (
     Argument,
+    array,
     assert_refused,
     choice,
     count,
@@ -31,6 +32,11 @@ def of_three(*shape: int) -> dict[str, torch.Tensor]:
 
 
 SUBJECTS = [
+    subject(
+        "Constant",
+        constants.Constant,
+        values=array(torch.ones(2)).but("a number", "empty", "another size", "one more dimension"),
+    ),
     subject(
         "Entry",
         observation.Entry,
