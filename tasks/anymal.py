@@ -18,7 +18,7 @@ from typing_extensions import TypedDict  # unpacked in signatures since Python 3
 
 from tasks.base import Edit, Task, check_timestep
 from tasks.constants import Constant
-from tasks.draws import Range, check_range, draws, uniform
+from tasks.draws import Range, check_range, draws, put, uniform
 from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
@@ -165,17 +165,18 @@ class Anymal(Task):
             yaw: heading, ``(n,)``, rad.
             generator: source of the noise on the joints.
         """
-        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         noise = draws(n, 12, generator) * 0.2 - 0.1
+        qpos = noise.new_zeros(n, self.model.nq)
         qpos[:, 7:19] = self._pose.like(noise) + noise
         qpos[:, 3], qpos[:, 6] = (yaw / 2).cos(), (yaw / 2).sin()
         qpos[:, 2] = self.foot_radius + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
-        zeros = torch.zeros(n, 12, dtype=torch.float64)
+        zeros, mocap_quat = noise.new_zeros(n, 12), noise.new_zeros(n, self.model.nmocap, 4)
+        mocap_quat[..., 0] = 1.0
         return State(
             qpos=qpos,
-            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
-            mocap_pos=torch.zeros(n, self.model.nmocap, 3, dtype=torch.float64),
-            mocap_quat=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, self.model.nmocap, 1),
+            qvel=noise.new_zeros(n, self.model.nv),
+            mocap_pos=noise.new_zeros(n, self.model.nmocap, 3),
+            mocap_quat=mocap_quat,
             variables={
                 "last_action": zeros,
                 "last_velocity": zeros.clone(),
@@ -220,7 +221,7 @@ class Anymal(Task):
 
     def ground(self, state: State, points: Tensor) -> Tensor:
         """Height of the ground at points ``(n, p, 2 or more)`` of the world frame, ``(n, p)``, m."""
-        return torch.zeros(points.shape[:2], dtype=points.dtype)
+        return points.new_zeros(points.shape[:2])
 
     def touching(self, state: State) -> Tensor:
         """Whether each foot stands on something, ``(n, 4)``."""
@@ -272,7 +273,7 @@ class Anymal(Task):
         if self.added_mass is not None:
             body = self.model.body("base").id
             mass = self._mass + uniform(self.added_mass, len(ids), generator)
-            simulation.expand("body_mass")[ids, body] = mass
+            put(simulation.expand("body_mass")[:, body], ids, mass)
             simulation.refresh(ids)
 
 

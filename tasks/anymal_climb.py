@@ -18,6 +18,7 @@ from typing_extensions import Unpack  # of typing since Python 3.11
 
 from tasks.anymal import Anymal, RobotArguments, into_base, rotation
 from tasks.base import register
+from tasks.constants import Constant
 from tasks.curriculum import Curriculum
 from tasks.draws import draws
 from tasks.observation import Entry
@@ -94,13 +95,13 @@ class AnymalClimb(Anymal):
         **robot: Unpack[RobotArguments],
     ) -> None:
         self.height = checks.real("height", height, LOWEST_BOX)
-        self.phase = checks.one_of("phase", phase, PHASES)
+        self._phase: Any = PHASES.index(checks.one_of("phase", phase, PHASES))  # on a device, a tensor
         self.curriculum = Curriculum(LAST_LEVEL, "success", "level", "distance", rising=curriculum)
         super().__init__(**robot)
         self.box = float(self.model.geom("box").size[0])  # half its edge, m; a cube sunk in the ground
-        self._grid_x, self._grid_y = (grid.clone() for grid in torch.cartesian_prod(*_axes()).unbind(-1))
-        footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
-        self._below = footprint.nonzero().squeeze(1)
+        grid = torch.cartesian_prod(*_axes()).T
+        self._grid = Constant(grid)  # x and y of every point
+        self._below = Constant(((grid[0].abs() < 0.45) & (grid[1].abs() < 0.25)).nonzero().squeeze(1))
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, command, height map."""
@@ -130,13 +131,15 @@ class AnymalClimb(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """A box of full height in front, on the left; any heading in phase C, else towards the box."""
-        return self._start(self.curriculum.hardest(n), generator, vary=0.0)
+        return self._start(self.curriculum.hardest(n, generator), generator, vary=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
-        return self._training_start(self.curriculum.start(n), generator)
+        return self._training_start(self.curriculum.start(n, generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: higher boxes after success, lower ones after failure, the next phase."""
         distance, fallen = self._distance(finished), self.fallen(finished, LOWEST)
         level = self.curriculum.judge(
@@ -145,6 +148,7 @@ class AnymalClimb(Anymal):
             success=self.success(finished),
             failed=fallen | (distance > FAILURE_DISTANCE),
             generator=generator,
+            rows=rows,
             distance=distance,
         )
         if self.curriculum.rising:
@@ -155,11 +159,22 @@ class AnymalClimb(Anymal):
         start = self._start(level, generator, vary=0.2 * self.curriculum.rising)
         return self.mapped_at_random(start, generator)
 
+    @property
+    def phase(self) -> Phase:
+        """Phase of training."""
+        return PHASES[int(self._phase)]
+
+    def in_phase(self, phase: Phase) -> bool | Tensor:
+        """Whether training is in a phase; on a device, a tensor that says so there."""
+        return self._phase == PHASES.index(phase)
+
     def _advance(self) -> None:
+        """On to the next phase; by arithmetic, since on a device nothing is asked."""
         values = self.curriculum.averages.values
-        if self.phase != "C" and values["success"] > PHASE_SUCCESS and values["level"] > PHASE_LEVEL:
-            self.phase = "B" if self.phase == "A" else "C"
-            self.curriculum.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
+        good = (values["success"] > PHASE_SUCCESS) & (values["level"] > PHASE_LEVEL)
+        over = good & (self._phase < len(PHASES) - 1)
+        self._phase = self._phase + over
+        values["success"] = values["success"] * (over == 0)  # the next phase is judged by its own episodes
 
     def _start(self, level: Tensor, generator: torch.Generator | None, vary: float) -> State:
         """Starts with the box in front, its centre on the left.
@@ -171,7 +186,7 @@ class AnymalClimb(Anymal):
         """
         n = len(level)
         u = draws(n, 4, generator)
-        yaw = (2 * u[:, 0] - 1) * math.pi * (self.phase == "C")
+        yaw = (2 * u[:, 0] - 1) * math.pi * self.in_phase("C")
         state = self.standing(n, yaw, generator)
         state.variables["level"] = level[:, None].clone()
         height = LOWEST_BOX + (self.height - LOWEST_BOX) * level / LAST_LEVEL
@@ -199,8 +214,9 @@ class AnymalClimb(Anymal):
             cos, sin = ahead.float().unsqueeze(-1).unbind(1)
             box = state.mocap_place(0)
             offset = (state.qpos[:, 0:2] - box[:, :2]).float()
-            x = torch.addcmul(offset[:, :1], cos, self._grid_x).addcmul_(sin, self._grid_y, value=-1)
-            y = torch.addcmul(offset[:, 1:], sin, self._grid_x).addcmul_(cos, self._grid_y)
+            grid_x, grid_y = self._grid.like(cos)
+            x = torch.addcmul(offset[:, :1], cos, grid_x).addcmul_(sin, grid_y, value=-1)
+            y = torch.addcmul(offset[:, 1:], sin, grid_x).addcmul_(cos, grid_y)
             inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= self.box
             return torch.mul(inside, (box[:, 2:] + self.box).float(), out=y)
 
@@ -237,14 +253,15 @@ class AnymalClimb(Anymal):
         gap, velocity, turning = self._gap(state), state.qvel[:, 0:3], state.qvel[:, 3:6]
         distance, turned = self._distance(state), 1 - self._heading_error(state)[:, 0]
         last = (state.time > self.episode_seconds - TASK_SECONDS).double() / TASK_SECONDS
-        ground = self.heights(state).index_select(1, self._below).mean(dim=1).double()
+        ground = self.heights(state)
+        ground = ground.index_select(1, self._below.like(ground)).mean(dim=1).double()
         walking = distance > STOP_DISTANCE
         asked = SPEED * gap[:, :2] / distance.clamp(min=1e-6)[:, None] * walking[:, None]
         near = 1 / (1 + 4 * gap.square().sum(-1))
         terms = {
             "position": last * near,
             "heading": last * near * (1 - 0.5 * turned),
-            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp() * (self.phase == "A"),
+            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp() * self.in_phase("A"),
             "alive": torch.ones_like(distance),
             "height": (state.qpos[:, 2] - ground - BASE_HEIGHT).square(),
             "vertical": velocity[:, 2].square(),
@@ -270,11 +287,11 @@ class AnymalClimb(Anymal):
 
     def metrics(self) -> dict[str, float]:
         """Averages over about 500 training episodes, and the phase (0, 1, 2 for A, B, C)."""
-        return {**self.curriculum.averages.values, "phase": float("ABC".index(self.phase))}
+        return {**self.curriculum.averages.numbers(), "phase": float(self._phase)}
 
     def state_dict(self) -> dict[str, Any]:
         """Phase and averages; levels are part of the state of the rows."""
-        return {"phase": self.phase, "averages": dict(self.curriculum.averages.values)}
+        return {"phase": self.phase, "averages": self.curriculum.averages.numbers()}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
@@ -282,7 +299,7 @@ class AnymalClimb(Anymal):
         checks.one_of("phase", phase, PHASES)
         self.curriculum.averages.load(averages)
         if self.curriculum.rising:  # without one it stays what was asked for
-            self.phase = phase
+            self._phase = PHASES.index(phase)
 
 
 def _axes() -> tuple[Tensor, Tensor]:

@@ -113,13 +113,15 @@ class AnymalPush(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """Cube and target in front on the left, at any distance of the curriculum."""
-        return self._start(self.curriculum.hardest(n), generator, spread=0.0)
+        return self._start(self.curriculum.hardest(n, generator), generator, spread=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Any direction; near targets, or with ``curriculum=False`` the whole range."""
-        return self._training_start(self.curriculum.start(n), generator)
+        return self._training_start(self.curriculum.start(n, generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: the next target is farther after success, nearer after no progress."""
         distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
         over = finished.time > self.episode_seconds - self.control_timestep / 2
@@ -129,6 +131,7 @@ class AnymalPush(Anymal):
             success=self.success(finished),
             failed=distance > 0.7 * start,
             generator=generator,
+            rows=rows,
         )
         return self._training_start(level, generator)
 
@@ -215,11 +218,11 @@ class AnymalPush(Anymal):
 
     def metrics(self) -> dict[str, float]:
         """Success rate and level, averaged over about the last 500 training episodes."""
-        return dict(self.curriculum.averages.values)
+        return self.curriculum.averages.numbers()
 
     def state_dict(self) -> dict[str, Any]:
         """The averages; levels are part of the state of the rows."""
-        return {"averages": dict(self.curriculum.averages.values)}
+        return {"averages": self.curriculum.averages.numbers()}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""

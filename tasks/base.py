@@ -24,7 +24,8 @@ import torch
 from torch import Tensor
 from typing_extensions import Self  # of typing since Python 3.11
 
-from tasks.draws import check_generator
+from tasks.constants import Constant
+from tasks.draws import device_of, put
 from tasks.observation import Entry, Observation
 from tasks.simulation import Simulation
 from tasks.state import Element, State, concatenate
@@ -113,6 +114,7 @@ class Task(abc.ABC):
                 f"expected a control_timestep that is a multiple of the model's timestep "
                 f"{timestep} s, got {self.control_timestep} s; change one of the two"
             )
+        self._friction = Constant(self.model.geom_friction[:, 0])
         self.robot = derive(self.model, group, carried=self.carried)
         self._observation = Observation(self.layout(), self.observation_limit)
         self.symmetry = Symmetry(
@@ -173,17 +175,23 @@ class Task(abc.ABC):
 
     def mapped_at_random(self, state: State, generator: torch.Generator | None) -> State:
         """Every row mapped by a uniformly drawn element: makes any distribution exactly symmetric."""
-        check_generator(generator)
+        device_of(generator)
         rows = len(checks.instance("state", state, State))
-        element = torch.randint(self.symmetry.group.order, (rows,), generator=generator)
+        order, device = self.symmetry.group.order, state.qpos.device
+        element = torch.randint(order, (rows,), generator=generator, device=device)
         return self.transform_state(state, element)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Start states for rows whose episode is over; a curriculum judges ``finished`` here.
 
         Args:
             finished: the last state of these rows; ``finished.time`` is 0 where no step was made.
             generator: the environment's generator; draw from nothing else.
+            rows: on a device, where to know how many rows are over is a stop, ``finished`` is the state of
+                all n, and this a mask ``(n,)`` of those that are over: starts of the others are not used,
+                and a curriculum must not judge them. None: all are over.
         """
         return self.sample_initial_state(len(finished), generator)
 
@@ -194,12 +202,17 @@ class Task(abc.ABC):
 
         Draw values whose distribution the group maps onto itself, or the task stops being
         symmetric.
+
+        Args:
+            simulation: the engine, whose fields are written to.
+            ids: k row numbers; on a device, a mask of all n rows. Draw ``len(ids)`` values, and write them
+                by :func:`tasks.draws.put`, which takes both.
+            generator: the environment's generator; draw from nothing else.
         """
 
     def scale_friction(self, simulation: Simulation, ids: Tensor, factor: Tensor) -> None:
-        """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(k,)``."""
-        own = torch.from_numpy(self.model.geom_friction[:, 0].copy())
-        simulation.expand("geom_friction")[ids, :, 0] = factor[:, None] * own
+        """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(len(ids),)``."""
+        put(simulation.expand("geom_friction")[..., 0], ids, factor[:, None] * self._friction.like(factor))
 
     @abc.abstractmethod
     def control(self, action: Tensor, state: State) -> Tensor:

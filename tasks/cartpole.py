@@ -116,7 +116,7 @@ class CartPole(Task):
         """The pole lies flat to the right; noise on its angle and on both velocities."""
         noise = draws(n, 3, generator) * 2 - 1
         noise *= START_NOISE
-        qpos = torch.zeros(len(noise), 2, dtype=torch.float64)
+        qpos = noise.new_zeros(len(noise), 2)
         qpos[:, 1] = START_ANGLE + noise[:, 0]
         return State(qpos=qpos, qvel=noise[:, 1:])
 

@@ -16,10 +16,10 @@ class Constant:
     Each copy is made once, so that later uses neither transfer anything nor wait. Do not write into one.
 
     Args:
-        values: a tensor, an array or nested lists.
+        values: a tensor, an array or nested lists. Whole numbers of a tensor, such as indices, stay whole.
 
     Attributes:
-        values: the numbers, float64 on the CPU.
+        values: the numbers on the CPU, float64 or whole.
 
     Example:
         >>> pose = Constant([0.4, -0.8])
@@ -30,14 +30,16 @@ class Constant:
     """
 
     def __init__(self, values: Any) -> None:
-        self.values = checks.array("values", values).clone()
+        whole = isinstance(values, Tensor) and values.dtype == torch.int64
+        self.values = (values if whole else checks.array("values", values)).clone()
         self._copies: dict[tuple[torch.dtype, torch.device], Tensor] = {}
 
     def like(self, x: Tensor) -> Tensor:
         """The numbers on the device and in the dtype of ``x``."""
         kind = (x.dtype, x.device)
         if kind not in self._copies:
-            self._copies[kind] = self.values.to(x)
+            dtype = x.dtype if self.values.is_floating_point() else None
+            self._copies[kind] = self.values.to(x.device, dtype)
         return self._copies[kind]
 
     def __reduce__(self) -> tuple[type[Constant], tuple[Tensor]]:

@@ -54,7 +54,7 @@ class State:
     def __post_init__(self) -> None:
         n = _rows("qpos", self.qpos, 2)
         if self.time is None:
-            self.time = torch.zeros(n, dtype=torch.float64)
+            self.time = torch.zeros(n, dtype=torch.float64, device=self.qpos.device)
         _rows("qvel", self.qvel, 2, n)
         _rows("time", self.time, 1, n)
         if self.mocap_pos is not None:
@@ -118,6 +118,10 @@ class State:
     def clone(self) -> State:
         """A copy that shares no memory with the simulation."""
         return self._map(Tensor.clone)
+
+    def to(self, device: torch.device) -> State:
+        """The same on a device; what is there already is not copied."""
+        return self._map(lambda x: x.to(device))
 
     def _map(self, function: Callable[[Tensor], Tensor]) -> State:
         return State(

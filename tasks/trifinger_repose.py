@@ -21,7 +21,7 @@ from torch import Tensor
 from tasks.base import Edit, Task, check_timestep, register
 from tasks.constants import Constant
 from tasks.curriculum import Curriculum
-from tasks.draws import Range, check_range, draws, uniform
+from tasks.draws import Range, check_range, draws, put, uniform
 from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
@@ -134,6 +134,9 @@ class TrifingerRepose(Task):
         signs = torch.tensor([-self.cube, self.cube], dtype=torch.float64)
         self._corners = Constant(torch.cartesian_prod(signs, signs, signs))
 
+        cube = self.model.body("cube")
+        self._inertia = Constant(cube.inertia / cube.mass)  # per mass
+
     def _read_finger(self) -> None:
         """Kinematics, m: offset of the tip from the swing axis, lift axis along it, links, height."""
         upper, middle, lower = (self.model.body(f"{part}0").pos for part in ("upper", "middle", "lower"))
@@ -188,13 +191,15 @@ class TrifingerRepose(Task):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
-        return self._start(self.curriculum.hardest(n), generator)
+        return self._start(self.curriculum.hardest(n, generator), generator)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """All goals; the first level, or with ``curriculum=False`` the last."""
-        return self.mapped_at_random(self._start(self.curriculum.start(n), generator), generator)
+        return self.mapped_at_random(self._start(self.curriculum.start(n, generator), generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: the next one reaches farther out after success, less far after failure."""
         over = finished.time > self.episode_seconds - self.control_timestep / 2
         figures = {"error": self.position_error(finished)}
@@ -208,6 +213,7 @@ class TrifingerRepose(Task):
             success=self.success(finished),
             failed=far,
             generator=generator,
+            rows=rows,
             **figures,
         )
         return self.mapped_at_random(self._start(level, generator), generator)
@@ -216,14 +222,14 @@ class TrifingerRepose(Task):
         n = len(level)
         radius = self.radius * (FIRST_SHARE + (1 - FIRST_SHARE) * level / LAST_LEVEL)
         u = draws(n, 17, generator)
-        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
+        qpos = u.new_zeros(n, self.model.nq)
         qpos[:, :9] = self._start_pose.like(qpos) + (2 * u[:, :9] - 1) * START_NOISE
         anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)
         qpos[:, 9:11] = _place(radius, right if self.difficulty == 2 else anywhere, u[:, 11])
         qpos[:, 11] = self.cube + 0.001  # exactly touching, rounding would decide which corners touch
         half = u[:, 12] * (2 * math.pi)  # half the yaw: over a whole turn, both signs of the quaternion
         qpos[:, 12], qpos[:, 15] = half.cos(), half.sin()
-        goal = torch.zeros(n, 1, 3, dtype=torch.float64)
+        goal = u.new_zeros(n, 1, 3)
         goal[:, 0, 2] = self._goal_height(u[:, 14])
         if self.difficulty != 2:
             goal[:, 0, :2] = _place(radius, right, u[:, 13])
@@ -232,15 +238,15 @@ class TrifingerRepose(Task):
             half = half + (2 * u[:, 15] - 1) * (self.yaw / 2) * (1 + level) / (1 + LAST_LEVEL)
             orientation[:, 0], orientation[:, 3] = half.cos(), half.sin()
         if self.difficulty == 4:
-            drawn = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+            drawn = torch.randn(n, 4, generator=generator, dtype=u.dtype, device=u.device)
             orientation = drawn / drawn.norm(dim=-1, keepdim=True)
         state = State(
             qpos=qpos,
-            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
+            qvel=u.new_zeros(n, self.model.nv),
             mocap_pos=goal,
             mocap_quat=orientation[:, None],
             variables={
-                "last_action": torch.zeros(n, 9, dtype=torch.float64),
+                "last_action": u.new_zeros(n, 9),
                 "level": level[:, None].clone(),
             },
         )
@@ -260,9 +266,8 @@ class TrifingerRepose(Task):
         if self.cube_mass is not None:
             mass = uniform(self.cube_mass, len(ids), generator)
             cube = self.model.body("cube").id
-            inertia = torch.from_numpy(self.model.body_inertia[cube] / self.model.body_mass[cube])
-            simulation.expand("body_mass")[ids, cube] = mass
-            simulation.expand("body_inertia")[ids, cube] = mass[:, None] * inertia
+            put(simulation.expand("body_mass")[:, cube], ids, mass)
+            put(simulation.expand("body_inertia")[:, cube], ids, mass[:, None] * self._inertia.like(mass))
             simulation.refresh(ids)
 
     def control(self, action: Tensor, state: State) -> Tensor:
@@ -347,11 +352,11 @@ class TrifingerRepose(Task):
 
     def metrics(self) -> dict[str, float]:
         """Success rate, final errors (m, rad) and level, means of about the last 500 episodes."""
-        return dict(self.curriculum.averages.values)
+        return self.curriculum.averages.numbers()
 
     def state_dict(self) -> dict[str, Any]:
         """The averages that :meth:`metrics` reports."""
-        return dict(self.curriculum.averages.values)
+        return self.curriculum.averages.numbers()
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
