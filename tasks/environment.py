@@ -221,10 +221,11 @@ class BatchedEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         over = self._over
         rows = torch.ones_like(over) if mask is None else rows_of("_reset", mask, len(over), self._place)
-        if self._restored and bool(rows.all()):
-            rows = over.clone()  # continue: only episodes that had ended when saved begin anew
-        self._restored = False
-        self._begin(rows)
+        continued, self._restored = self._restored and bool(rows.all()), False
+        if continued:  # only episodes that had ended when saved begin anew
+            rows = over.clone()
+        if not continued or bool(rows.any()):  # or a device would draw starts that nobody takes
+            self._begin(rows)
         if self._stagger and bool(rows.all()):
             self._stagger = False
             draw = {"generator": self._generator, "device": self._place}

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from tasks.constants import Constant
 from tasks.state import State
 from torchrl_sym import Representation, checks
 
@@ -90,18 +91,18 @@ class Observation:
         self._scale = self._row("scale")
         self._divisor = self._row("divisor")
 
-    def _row(self, name: str) -> Tensor | None:
+    def _row(self, name: str) -> Constant | None:
         """What every number is multiplied or divided by, ``(dim,)``; None where that changes nothing."""
         factors = [getattr(entry, name) for entry in self._entries for _ in range(entry.representation.dim)]
-        return torch.tensor(factors, dtype=torch.float64) if set(factors) != {1.0} else None
+        return Constant(factors) if set(factors) != {1.0} else None
 
     def __call__(self, state: State) -> Tensor:
         """The observation of n rows, a new tensor ``(n, dim)`` float32."""
         observation = torch.cat([entry.value(state) for entry in self._entries], dim=1)
         if self._scale is not None:
-            observation.mul_(self._scale)
+            observation.mul_(self._scale.like(observation))
         if self._divisor is not None:
-            observation.div_(self._divisor)
+            observation.div_(self._divisor.like(observation))
         observation = observation.float()
         if self._limit is not None:
             observation.clamp_(-self._limit, self._limit)
