@@ -233,6 +233,13 @@ class BatchedEnv(EnvBase):
             self._state.time[:] = steps * self.task.control_timestep
         return self._first_output()
 
+    def maybe_reset(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Reset the rows that are done; a device is not asked whether there are any."""
+        if self._asks:
+            return super().maybe_reset(tensordict)
+        done = TensorDict(_reset=tensordict["done"], batch_size=self.batch_size, device=self.device)
+        return tensordict.update(self._reset(done))  # other rows observe what they did before
+
     def _begin(self, rows: Tensor) -> None:
         """Start episodes of the rows of a mask; which they are is asked only where that costs nothing."""
         task, generator = self.task, self._generator

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import tasks
-from tasks import base, draws, paths, rendering, state, suite
+from tasks import base, draws, engines, paths, rendering, specs, state, suite
 from tests.malformed import (
     Argument,
     array,
@@ -155,6 +155,14 @@ SUBJECTS = [
         state=state_,
         g=element("reflect-x", 2, **{"of three": torch.zeros(3, dtype=torch.long)}),
     ),
+    subject(
+        "make_engine",
+        functools.partial(engines.make_engine, num_threads=1),
+        task=task,
+        num_envs=count(2, huge=2**40),
+        engine=optional(choice("mujoco")),
+    ),
+    subject("make_specs", specs.make_specs, task=task, num_envs=count(2)),
     subject("mapped_at_random", CARTPOLE.mapped_at_random, state=state_, generator=generator),
     subject("load", tasks.load, name=choice("cartpole"), random=optional(count(1, low=0, huge=2**40))),
     subject("SuiteTask", suite.SuiteTask, description=task, random=optional(count(1, low=0, huge=2**40))),
