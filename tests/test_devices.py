@@ -6,6 +6,8 @@ that each of these fails. What meta forgives is refused by a mode that sees ever
 is made on the CPU, and one that is carried over in every step.
 """
 
+import functools
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -32,7 +34,14 @@ SETTINGS = [
     ("trifinger_repose", {"difficulty": 2}),
     ("trifinger_repose", {"difficulty": 4, "curriculum": False}),
 ]
-all_settings = pytest.mark.parametrize(("name", "kwargs"), SETTINGS, ids=str)
+all_settings = pytest.mark.parametrize("number", range(len(SETTINGS)), ids=[str(s) for s in SETTINGS])
+
+
+@functools.cache
+def created(number):
+    """The task of a setting, made once."""
+    name, kwargs = SETTINGS[number]
+    return base.create(name, **kwargs)
 
 
 class MetaGenerator(torch.Generator):
@@ -127,8 +136,8 @@ def played(env):
 
 
 @all_settings
-def test_steps_and_resets_stay_on_the_device(name, kwargs):
-    env = MetaEnv(base.create(name, **kwargs))
+def test_steps_and_resets_stay_on_the_device(number):
+    env = MetaEnv(created(number))
     played(env)  # constants are copied there on first use
     with OnDevice():
         outs = played(env)
@@ -140,8 +149,8 @@ def test_steps_and_resets_stay_on_the_device(name, kwargs):
 
 
 @all_settings
-def test_every_function_of_a_task_stays_on_the_device(name, kwargs):
-    task, n = base.create(name, **kwargs), 4
+def test_every_function_of_a_task_stays_on_the_device(number):
+    task, n = created(number), 4
 
     def everything():
         draw = MetaGenerator()
