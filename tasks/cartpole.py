@@ -99,15 +99,15 @@ class CartPole(Task):
         joint = "sign of its joint"
         return (
             Entry(
-                "cart velocity", lambda state: state.qvel[:, :1],
+                "cart velocity", lambda state: state.qvel.narrow(1, 0, 1),
                 cart, "m/s", "world", joint, divisor=CART_RANGE,
             ),
             Entry(
-                "pole angle from upright", lambda state: _angle(state)[:, None],
+                "pole angle from upright", lambda state: _angle(state).unsqueeze(1),
                 pole, "rad", "world", joint, divisor=ANGLE_RANGE,
             ),
             Entry(
-                "pole velocity", lambda state: state.qvel[:, 1:],
+                "pole velocity", lambda state: state.qvel.narrow(1, 1, 1),
                 pole, "rad/s", "world", joint, divisor=POLE_RANGE,
             ),
         )  # fmt: skip
