@@ -88,7 +88,14 @@ def observation(task: Task) -> str:
     for entry in task.layout():
         end = first + entry.representation.dim
         rows.append(
-            [f"{first}:{end}", entry.name, entry.unit, entry.frame, f"{entry.scale:.4g}", entry.kind]
+            [
+                f"{first}:{end}",
+                entry.name,
+                entry.unit,
+                entry.frame,
+                f"{entry.scale / entry.divisor:.4g}",
+                entry.kind,
+            ]
         )
         first = end
     return table(["slice", "what", "unit", "frame", "scale", "transforms"], rows)

@@ -2,20 +2,24 @@
 
     python examples/train.py anymal_push --folder runs/push
     python examples/train.py anymal_climb --folder runs/low --task-kwargs height 0.2 phase C
+    torchrun --nproc-per-node=4 examples/train.py anymal_push --folder runs/push
 
 The run can be killed and started again: it continues where its last checkpoint was. Stages are trained in
 order, in `stage_0`, `stage_1`, ... of the folder; what is changed on the command line is changed in all of
-them.
+them. The processes of `torchrun` share one training, whose settings are those of the whole: each has its
+part of the environments, and with `--config.device cuda` a card of its own. As many can continue it.
 """
 
 import dataclasses
 import functools
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 import torch
 import tyro
+from torch import distributed
 
 import tasks
 from tasks.evaluation import evaluate
@@ -40,11 +44,24 @@ class Arguments:
     episodes: int = 500
     """Evaluation episodes per goal."""
     threads: int = 1
-    """Physics threads; networks use one."""
+    """Physics threads of a process; networks use one."""
+
+
+def join(device: str) -> bool:
+    """Join the other processes of `torchrun`, if it started this one; whether this is the first."""
+    if "LOCAL_RANK" not in os.environ:
+        return True
+    backend = "gloo"
+    if torch.device(device).type == "cuda":
+        torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+        backend = "cpu:gloo,cuda:nccl"
+    distributed.init_process_group(backend)
+    return distributed.get_rank() == 0
 
 
 def main(arguments: Arguments) -> None:
     torch.set_num_threads(1)
+    first = join(arguments.config.device)
     setting = SETTINGS[arguments.task]
     before, asked = dataclasses.asdict(setting.config), dataclasses.asdict(arguments.config)
     changes = {name: value for name, value in asked.items() if value != before[name]}
@@ -54,6 +71,10 @@ def main(arguments: Arguments) -> None:
     symmetry = make_env(num_envs=1, seed=0, **stages[0].task).symmetry
     where = {"folder": arguments.folder, "logger": arguments.logger}
     train_stages(stages, make_env, symmetry, **where, progress=True).run()
+    if distributed.is_initialized():
+        distributed.destroy_process_group()
+    if not first:
+        return
 
     for what, evaluated in setting.evaluations.items():
         env = make_env(num_envs=1, seed=0, **kwargs | evaluated)

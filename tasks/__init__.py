@@ -15,7 +15,7 @@ from tasks import anymal_push as anymal_push
 from tasks import base
 from tasks import cartpole as cartpole
 from tasks import trifinger_repose as trifinger_repose
-from tasks.environment import make_env
+from tasks.making import make_env
 
 if TYPE_CHECKING:
     from tasks.suite import load

@@ -11,11 +11,15 @@ functions of the state.
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 import torch
 from torch import Tensor
+from typing_extensions import TypedDict  # unpacked in signatures since Python 3.11
 
-from tasks.base import Edit, Entry, Task, check_timestep
-from tasks.draws import Range, check_range, draws, uniform
+from tasks.base import Edit, Task, check_timestep
+from tasks.constants import Constant
+from tasks.draws import Range, check_range, draws, put, uniform
+from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation, checks
@@ -29,19 +33,20 @@ DEFAULT_POSE = (0.0, 0.4, -0.8, 0.0, 0.4, -0.8, 0.0, -0.4, 0.8, 0.0, -0.4, 0.8)
 ACTION_RANGE = 2.0
 # What observations are multiplied by (legged_gym); the last action is seen in steps of 0.5 rad.
 LINEAR_SCALE, ANGULAR_SCALE, JOINT_VELOCITY_SCALE, ACTION_SCALE = 2.0, 0.25, 0.05, 4.0
-# Observations beyond it are cut off: a robot that tumbles must not blow up the networks.
-OBSERVATION_LIMIT = 20.0
-FOOT_RADIUS = 0.03
 # A foot this close to the ground counts as standing on it, m.
 TOUCH_DISTANCE = 0.01
-# Kinematics of a leg, m: hip and thigh origins, knee below thigh, foot below knee (assets/README.md).
-_HIP, _THIGH, _KNEE, _FOOT = (
-    (0.2999, 0.104),
-    (0.0599, 0.08381),
-    (0.1003, -0.285),
-    (0.08795, 0.01305, -0.31547),
-)
-_SIDE_X, _SIDE_Y = (1.0, 1.0, -1.0, -1.0), (1.0, -1.0, 1.0, -1.0)
+
+
+class RobotArguments(TypedDict, total=False):
+    """Keyword arguments of :class:`Anymal`, for the signatures of tasks that hand them on."""
+
+    episode_seconds: float | None
+    physics_timestep: float
+    friction: Range | None
+    added_mass: Range | None
+    payload: float
+    payload_position: tuple[float, float, float]
+    weak_leg: str | None
 
 
 class Anymal(Task):
@@ -64,7 +69,7 @@ class Anymal(Task):
     """
 
     control_timestep = 0.02
-    action_size = 12
+    observation_limit = 20.0  # a robot that tumbles must not blow up the networks
     max_velocity = 100.0
 
     def __init__(
@@ -89,23 +94,57 @@ class Anymal(Task):
         super().__init__(PointGroup.klein_four(), episode_seconds=episode_seconds, edit=edit)
         self._mass = float(self.model.body("base").mass[0])
         self.added_mass = check_range("added_mass", added_mass, above=-self._mass)
-        self._pose = torch.tensor(DEFAULT_POSE, dtype=torch.float64)
-        self._side_x = torch.tensor(_SIDE_X, dtype=torch.float64)
-        self._side_y = torch.tensor(_SIDE_Y, dtype=torch.float64)
+        self._pose = Constant(DEFAULT_POSE)
+        self._read_legs()
+        self._read_drives()
+
+    def _read_legs(self) -> None:
+        """Where hip, thigh, knee and foot of every leg are in the part above them, m."""
+        model = self.model
+        parts = [[model.body(f"{leg}_{part}").pos for leg in LEGS] for part in ("hip", "thigh", "shank")]
+        parts.append([model.geom(f"{leg}_foot").pos for leg in LEGS])
+        self._legs = Constant(np.array(parts).transpose(0, 2, 1))  # (part, axis, leg)
+        self.foot_radius = float(model.geom(f"{LEGS[0]}_foot").size[0])
+
+    def _read_drives(self) -> None:
+        """Gains (N m/rad, N m s/rad) and largest torque (N m) of a joint; all joints have the same."""
+        drive, joint = self.model.actuator(JOINTS[0]), self.model.joint(JOINTS[0])
+        self._stiffness, self._damping = float(drive.gainprm[0]), -float(drive.biasprm[2])
+        self._torque = float(self.model.jnt_actfrcrange[joint.id, 1])
 
     def proprioception(self) -> tuple[Entry, ...]:
         """The first 45 numbers of every observation."""
         group, robot = self.robot.group, self.robot
         joints = robot.joints(JOINTS)
         by_joint = "permutation and signs of the joints"
+
+        def velocity(state: State) -> Tensor:
+            return into_base(rotation(state), state.qvel[:, 0:3])
+
         return (
-            Entry("linear velocity", polar(group), "m/s", "base", "polar vector", LINEAR_SCALE),
-            Entry("angular velocity", axial(group), "rad/s", "base", "axial vector", ANGULAR_SCALE),
-            Entry("direction of gravity", polar(group), "1", "base", "polar vector"),
-            Entry("joint positions from the standing pose", joints, "rad", "joints", by_joint),
-            Entry("joint velocities", joints, "rad/s", "joints", by_joint, JOINT_VELOCITY_SCALE),
-            Entry("last action", robot.actuators, "2 rad", "joints", by_joint, ACTION_SCALE),
-        )
+            Entry("linear velocity", velocity, polar(group), "m/s", "base", "polar vector", LINEAR_SCALE),
+            Entry(
+                "angular velocity", lambda state: state.qvel[:, 3:6],
+                axial(group), "rad/s", "base", "axial vector", ANGULAR_SCALE,
+            ),
+            Entry(
+                "direction of gravity", lambda state: -rotation(state)[:, 2],
+                polar(group), "1", "base", "polar vector",
+            ),
+            Entry(
+                "joint positions from the standing pose",
+                lambda state: state.qpos[:, 7:19] - self._pose.like(state.qpos),
+                joints, "rad", "joints", by_joint,
+            ),
+            Entry(
+                "joint velocities", lambda state: state.qvel[:, 6:18],
+                joints, "rad/s", "joints", by_joint, JOINT_VELOCITY_SCALE,
+            ),
+            Entry(
+                "last action", lambda state: state.variables["last_action"],
+                robot.actuators, "2 rad", "joints", by_joint, ACTION_SCALE,
+            ),
+        )  # fmt: skip
 
     def variables(self) -> dict[str, Representation]:
         """Last action, joint velocities one step ago, time in the air of every foot, curriculum level."""
@@ -126,17 +165,18 @@ class Anymal(Task):
             yaw: heading, ``(n,)``, rad.
             generator: source of the noise on the joints.
         """
-        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
         noise = draws(n, 12, generator) * 0.2 - 0.1
-        qpos[:, 7:19] = self._pose + noise
+        qpos = noise.new_zeros(n, self.model.nq)
+        qpos[:, 7:19] = self._pose.like(noise) + noise
         qpos[:, 3], qpos[:, 6] = (yaw / 2).cos(), (yaw / 2).sin()
-        qpos[:, 2] = FOOT_RADIUS + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
-        zeros = torch.zeros(n, 12, dtype=torch.float64)
+        qpos[:, 2] = self.foot_radius + 0.005 - self.feet_in_base(qpos[:, 7:19])[..., 2].amin(dim=1)
+        zeros, mocap_quat = noise.new_zeros(n, 12), noise.new_zeros(n, self.model.nmocap, 4)
+        mocap_quat[..., 0] = 1.0
         return State(
             qpos=qpos,
-            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
-            mocap_pos=torch.zeros(n, self.model.nmocap, 3, dtype=torch.float64),
-            mocap_quat=torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).repeat(n, self.model.nmocap, 1),
+            qvel=noise.new_zeros(n, self.model.nv),
+            mocap_pos=noise.new_zeros(n, self.model.nmocap, 3),
+            mocap_quat=mocap_quat,
             variables={
                 "last_action": zeros,
                 "last_velocity": zeros.clone(),
@@ -147,7 +187,8 @@ class Anymal(Task):
 
     def control(self, action: Tensor, state: State) -> Tensor:
         """Joint position targets, rad."""
-        return action.double().clamp(-1.0, 1.0) * ACTION_RANGE + self._pose
+        target = action.double().clamp(-1.0, 1.0) * ACTION_RANGE
+        return target + self._pose.like(target)
 
     def update(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Remember the action, the joint velocities, and how long each foot has been in the air."""
@@ -158,31 +199,17 @@ class Anymal(Task):
             "air_time": air,
         }
 
-    def observe_robot(self, state: State, observation: Tensor) -> None:
-        """Write the 45 proprioceptive numbers into the first columns of ``(n, 45 or more)``."""
-        turn = rotation(state)
-        parts = (
-            into_base(turn, state.qvel[:, 0:3]) * LINEAR_SCALE,
-            state.qvel[:, 3:6] * ANGULAR_SCALE,
-            -turn[:, 2],
-            state.qpos[:, 7:19] - self._pose,
-            state.qvel[:, 6:18] * JOINT_VELOCITY_SCALE,
-            state.variables["last_action"] * ACTION_SCALE,
-        )
-        torch.cat([part.float() for part in parts], dim=1, out=observation[:, :45])
-
     def feet_in_base(self, joints: Tensor) -> Tensor:
         """Centres of the feet in the base frame, ``(n, 12)`` joint angles to ``(n, 4, 3)``, m."""
+        hip, thigh, knee, foot = self._legs.like(joints)  # (axis, leg) each
         q1, q2, q3 = joints.unflatten(-1, (4, 3)).unbind(-1)
         q23 = q2 + q3
-        fx, fz = _FOOT[0] * self._side_x, _FOOT[2]
         sin, cos = q23.sin(), q23.cos()
-        x = _KNEE[1] * q2.sin() + fx * cos + fz * sin + _THIGH[0] * self._side_x
-        z = _KNEE[1] * q2.cos() - fx * sin + fz * cos
-        y = (_THIGH[1] + _KNEE[0] + _FOOT[1]) * self._side_y
+        x = knee[2] * q2.sin() + foot[0] * cos + foot[2] * sin + thigh[0]
+        z = knee[2] * q2.cos() - foot[0] * sin + foot[2] * cos
+        y = thigh[1] + knee[1] + foot[1]
         sin, cos = q1.sin(), q1.cos()
-        foot = (x + _HIP[0] * self._side_x, y * cos - z * sin + _HIP[1] * self._side_y, y * sin + z * cos)
-        return torch.stack(foot, dim=-1)
+        return torch.stack([x + hip[0], y * cos - z * sin + hip[1], y * sin + z * cos], dim=-1)
 
     def feet(self, state: State) -> Tensor:
         """Centres of the feet in the world frame, ``(n, 4, 3)``, m."""
@@ -194,14 +221,14 @@ class Anymal(Task):
 
     def ground(self, state: State, points: Tensor) -> Tensor:
         """Height of the ground at points ``(n, p, 2 or more)`` of the world frame, ``(n, p)``, m."""
-        return torch.zeros(points.shape[:2], dtype=points.dtype)
+        return points.new_zeros(points.shape[:2])
 
     def touching(self, state: State) -> Tensor:
         """Whether each foot stands on something, ``(n, 4)``."""
 
         def compute() -> Tensor:
             feet = self.feet(state)
-            return feet[..., 2] - self.ground(state, feet) < FOOT_RADIUS + TOUCH_DISTANCE
+            return feet[..., 2] - self.ground(state, feet) < self.foot_radius + TOUCH_DISTANCE
 
         return state.shared("touching", compute)
 
@@ -218,11 +245,12 @@ class Anymal(Task):
     def effort(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Regularisation: squares of torques, joint accelerations and changes of the action, ``(n,)``."""
         variables, velocity = state.variables, state.qvel[:, 6:18]
-        torque = 80.0 * (self.control(action, state) - state.qpos[:, 7:19]) - 2.0 * velocity
+        stretch = self.control(action, state) - state.qpos[:, 7:19]
+        torque = self._stiffness * stretch - self._damping * velocity
         acceleration = (velocity - variables["last_velocity"]) / self.control_timestep
         change = (action.double().clamp(-1.0, 1.0) - variables["last_action"]) * ACTION_RANGE
         return {
-            "torque": torque.clamp(-80.0, 80.0).square().sum(-1),
+            "torque": torque.clamp(-self._torque, self._torque).square().sum(-1),
             "acceleration": acceleration.square().sum(-1),
             "action_rate": change.square().sum(-1),
         }
@@ -245,7 +273,7 @@ class Anymal(Task):
         if self.added_mass is not None:
             body = self.model.body("base").id
             mass = self._mass + uniform(self.added_mass, len(ids), generator)
-            simulation.expand("body_mass")[ids, body] = mass
+            put(simulation.expand("body_mass")[:, body], ids, mass)
             simulation.refresh(ids)
 
 

@@ -14,16 +14,18 @@ from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack  # of typing since Python 3.11
 
-from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
-from tasks.base import Entry, register
-from tasks.curriculum import Averages, levels, next_level
+from tasks.anymal import Anymal, RobotArguments, into_base, rotation
+from tasks.base import register
+from tasks.constants import Constant
+from tasks.curriculum import Curriculum
 from tasks.draws import draws
+from tasks.observation import Entry
 from tasks.state import State
 from torchrl_sym import checks
 from torchrl_sym.representations import heading, height_map, invariant, polar
 
-BOX = 1.0  # half its edge, m; a cube sunk in the ground
 # Where the centre of the box is, m: ahead, and at most this far to the side.
 BOX_DISTANCE, BOX_OFFSET = (1.7, 2.0), 0.3
 TARGET_HEIGHT = 0.5  # of the target over the top of the box, m: the height of a standing robot
@@ -81,64 +83,98 @@ class AnymalClimb(Anymal):
     name = "anymal_climb"
     asset = "anymal_climb.xml"
     episode_seconds = 6.0
-    observation_size = 282
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
     def __init__(
-        self, *, height: float = 0.3, phase: Phase = "A", curriculum: bool = True, **robot: Any
+        self,
+        *,
+        height: float = 0.3,
+        phase: Phase = "A",
+        curriculum: bool = True,
+        **robot: Unpack[RobotArguments],
     ) -> None:
         self.height = checks.real("height", height, LOWEST_BOX)
-        self.phase = checks.one_of("phase", phase, PHASES)
-        self.curriculum = checks.flag("curriculum", curriculum)
+        self._phase: Any = PHASES.index(checks.one_of("phase", phase, PHASES))  # on a device, a tensor
+        self.curriculum = Curriculum(LAST_LEVEL, "success", "level", "distance", rising=curriculum)
         super().__init__(**robot)
-        self.averages = Averages("success", "level", "distance")
-        self._grid_x, self._grid_y = (grid.clone() for grid in torch.cartesian_prod(*_axes()).unbind(-1))
-        footprint = (self._grid_x.abs() < 0.45) & (self._grid_y.abs() < 0.25)
-        self._below = footprint.nonzero().squeeze(1)
+        self.box = float(self.model.geom("box").size[0])  # half its edge, m; a cube sunk in the ground
+        grid = torch.cartesian_prod(*_axes()).T
+        self._grid = Constant(grid)  # x and y of every point
+        self._below = Constant(((grid[0].abs() < 0.45) & (grid[1].abs() < 0.25)).nonzero().squeeze(1))
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, command, height map."""
         group = self.robot.group
+
+        def target(state: State) -> Tensor:
+            return into_base(rotation(state), self._gap(state))
+
+        def time_left(state: State) -> Tensor:
+            return 1 - state.time[:, None] / self.episode_seconds
+
+        def heights(state: State) -> Tensor:  # below a standing robot's base
+            level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
+            return (self.heights(state) - level).clamp_(-1.0, 1.0)
+
+        turned = "sine changes sign in a mirror"
         return (
             *self.proprioception(),
-            Entry("target position", polar(group), "m", "base", "polar vector", TARGET_SCALE),
-            Entry("heading error (cos, sin)", heading(group), "1", "base", "sine changes sign in a mirror"),
-            Entry("time left", invariant(group, 1), "1", "-", "invariant"),
+            Entry("target position", target, polar(group), "m", "base", "polar vector", TARGET_SCALE),
+            Entry("heading error (cos, sin)", self._heading_error, heading(group), "1", "base", turned),
+            Entry("time left", time_left, invariant(group, 1), "1", "-", "invariant"),
             Entry(
-                "heights of the ground", height_map(group, *_axes()), "m", "heading",
+                "heights of the ground", heights, height_map(group, *_axes()), "m", "heading",
                 "permutation of the grid's points", HEIGHT_SCALE,
             ),
         )  # fmt: skip
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """A box of full height in front, on the left; any heading in phase C, else towards the box."""
-        return self._start(levels(n, LAST_LEVEL), generator, vary=0.0)
+        return self._start(self.curriculum.hardest(n, generator), generator, vary=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Boxes on all sides that the group reaches; low ones, or with ``curriculum=False`` the highest."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        return self.mapped_at_random(self._start(level, generator, vary=0.2 * self.curriculum), generator)
+        return self._training_start(self.curriculum.start(n, generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: higher boxes after success, lower ones after failure, the next phase."""
-        distance = self._distance(finished)
-        success, fallen = self.success(finished), self.fallen(finished, LOWEST)
-        whole = fallen | self._over(finished)
-        level = finished.variables["level"][:, 0]
-        self.averages.update(success=success[whole], level=level[whole], distance=distance[whole])
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        self._advance()
-        failure = whole & ~success & (fallen | (distance > FAILURE_DISTANCE))
-        level = next_level(level, whole & success, failure, LAST_LEVEL, generator)
-        return self.mapped_at_random(self._start(level, generator, vary=0.2), generator)
+        distance, fallen = self._distance(finished), self.fallen(finished, LOWEST)
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=fallen | self._over(finished),
+            success=self.success(finished),
+            failed=fallen | (distance > FAILURE_DISTANCE),
+            generator=generator,
+            rows=rows,
+            distance=distance,
+        )
+        if self.curriculum.rising:
+            self._advance()
+        return self._training_start(level, generator)
+
+    def _training_start(self, level: Tensor, generator: torch.Generator | None) -> State:
+        start = self._start(level, generator, vary=0.2 * self.curriculum.rising)
+        return self.mapped_at_random(start, generator)
+
+    @property
+    def phase(self) -> Phase:
+        """Phase of training."""
+        return PHASES[int(self._phase)]
+
+    def in_phase(self, phase: Phase) -> bool | Tensor:
+        """Whether training is in a phase; on a device, a tensor that says so there."""
+        return self._phase == PHASES.index(phase)
 
     def _advance(self) -> None:
-        values = self.averages.values
-        if self.phase != "C" and values["success"] > PHASE_SUCCESS and values["level"] > PHASE_LEVEL:
-            self.phase = "B" if self.phase == "A" else "C"
-            self.averages.values["success"] = 0.0  # the next phase is judged by its own episodes
+        """On to the next phase; by arithmetic, since on a device nothing is asked."""
+        values = self.curriculum.averages.values
+        good = (values["success"] > PHASE_SUCCESS) & (values["level"] > PHASE_LEVEL)
+        over = good & (self._phase < len(PHASES) - 1)
+        self._phase = self._phase + over
+        values["success"] = values["success"] * (over == 0)  # the next phase is judged by its own episodes
 
     def _start(self, level: Tensor, generator: torch.Generator | None, vary: float) -> State:
         """Starts with the box in front, its centre on the left.
@@ -150,41 +186,39 @@ class AnymalClimb(Anymal):
         """
         n = len(level)
         u = draws(n, 4, generator)
-        yaw = (2 * u[:, 0] - 1) * math.pi * (self.phase == "C")
+        yaw = (2 * u[:, 0] - 1) * math.pi * self.in_phase("C")
         state = self.standing(n, yaw, generator)
         state.variables["level"] = level[:, None].clone()
         height = LOWEST_BOX + (self.height - LOWEST_BOX) * level / LAST_LEVEL
         height = height * (1 - vary * u[:, 3])
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        box, target = state.mocap_pos[:, 0], state.mocap_pos[:, 1]
+        box, target = state.mocap_place(0), state.mocap_place(1)
         box[:, 0] = BOX_DISTANCE[0] + (BOX_DISTANCE[1] - BOX_DISTANCE[0]) * u[:, 1]
         box[:, 1] = BOX_OFFSET * u[:, 2]
-        box[:, 2] = height - BOX
+        box[:, 2] = height - self.box
         target[:] = box
         target[:, 2] = height + TARGET_HEIGHT
-        state.mocap_quat[:, 1] = state.qpos[:, 3:7]
+        state.mocap_turn(1)[:] = state.qpos[:, 3:7]
         return state
 
     def ground(self, state: State, points: Tensor) -> Tensor:
         """Height of the box where it is, else zero."""
-        assert state.mocap_pos is not None
-        box = state.mocap_pos[:, 0].to(points.dtype)
+        box = state.mocap_place(0).to(points.dtype)
         gap = (points[..., :2] - box[:, None, :2]).abs_()
-        return (gap <= BOX).all(dim=-1) * (box[:, None, 2] + BOX)
+        return (gap <= self.box).all(dim=-1) * (box[:, None, 2] + self.box)
 
     def heights(self, state: State) -> Tensor:
         """Height of the ground at the points of the map, ``(n, 231)`` float32, m, in the world frame."""
 
         def compute() -> Tensor:
-            assert state.mocap_pos is not None
             ahead = self._ahead(state)
             cos, sin = ahead.float().unsqueeze(-1).unbind(1)
-            box = state.mocap_pos[:, 0]
+            box = state.mocap_place(0)
             offset = (state.qpos[:, 0:2] - box[:, :2]).float()
-            x = torch.addcmul(offset[:, :1], cos, self._grid_x).addcmul_(sin, self._grid_y, value=-1)
-            y = torch.addcmul(offset[:, 1:], sin, self._grid_x).addcmul_(cos, self._grid_y)
-            inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= BOX
-            return torch.mul(inside, (box[:, 2:] + BOX).float(), out=y)
+            grid_x, grid_y = self._grid.like(cos)
+            x = torch.addcmul(offset[:, :1], cos, grid_x).addcmul_(sin, grid_y, value=-1)
+            y = torch.addcmul(offset[:, 1:], sin, grid_x).addcmul_(cos, grid_y)
+            inside = torch.maximum(x.abs_(), y.abs_(), out=x) <= self.box
+            return torch.mul(inside, (box[:, 2:] + self.box).float(), out=y)
 
         return state.shared("heights", compute)
 
@@ -199,15 +233,13 @@ class AnymalClimb(Anymal):
 
     def _heading_error(self, state: State) -> Tensor:
         """(cos, sin) of the turn from the robot's heading to the one asked for, ``(n, 2)``."""
-        assert state.mocap_quat is not None
-        w, z = state.mocap_quat[:, 1, 0], state.mocap_quat[:, 1, 3]
+        w, _, _, z = state.mocap_turn(1).unbind(-1)
         cos, sin = w * w - z * z, 2 * w * z
         x, y = self._ahead(state).unbind(-1)
         return torch.stack([cos * x + sin * y, sin * x - cos * y], dim=-1)
 
     def _gap(self, state: State) -> Tensor:
-        assert state.mocap_pos is not None
-        return state.mocap_pos[:, 1] - state.qpos[:, 0:3]
+        return state.mocap_place(1) - state.qpos[:, 0:3]
 
     def _distance(self, state: State) -> Tensor:
         """Horizontal distance of base and target, ``(n,)``, m."""
@@ -216,32 +248,20 @@ class AnymalClimb(Anymal):
     def _over(self, state: State) -> Tensor:
         return state.time > self.episode_seconds - self.control_timestep / 2
 
-    def observe(self, state: State) -> Tensor:
-        """Proprioception, command, and the heights below a standing robot's base."""
-        observation = torch.empty(len(state), 282)
-        self.observe_robot(state, observation)
-        observation[:, 45:48] = into_base(rotation(state), self._gap(state)) * TARGET_SCALE
-        observation[:, 48:50] = self._heading_error(state)
-        observation[:, 50] = 1 - state.time / self.episode_seconds
-        observation[:, :51].clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-        level = (state.qpos[:, 2:3] - BASE_HEIGHT).float()
-        heights = torch.sub(self.heights(state), level, out=observation[:, 51:])
-        heights.clamp_(-1.0, 1.0).mul_(HEIGHT_SCALE)
-        return observation
-
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Be on the box at the end; in phase A also walk towards it; walk well."""
         gap, velocity, turning = self._gap(state), state.qvel[:, 0:3], state.qvel[:, 3:6]
         distance, turned = self._distance(state), 1 - self._heading_error(state)[:, 0]
         last = (state.time > self.episode_seconds - TASK_SECONDS).double() / TASK_SECONDS
-        ground = self.heights(state).index_select(1, self._below).mean(dim=1).double()
+        ground = self.heights(state)
+        ground = ground.index_select(1, self._below.like(ground)).mean(dim=1).double()
         walking = distance > STOP_DISTANCE
         asked = SPEED * gap[:, :2] / distance.clamp(min=1e-6)[:, None] * walking[:, None]
         near = 1 / (1 + 4 * gap.square().sum(-1))
         terms = {
             "position": last * near,
             "heading": last * near * (1 - 0.5 * turned),
-            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp() * (self.phase == "A"),
+            "velocity": (-(velocity[:, :2] - asked).square().sum(-1) / 0.25).exp() * self.in_phase("A"),
             "alive": torch.ones_like(distance),
             "height": (state.qpos[:, 2] - ground - BASE_HEIGHT).square(),
             "vertical": velocity[:, 2].square(),
@@ -262,25 +282,24 @@ class AnymalClimb(Anymal):
 
     def success(self, state: State) -> Tensor:
         """The robot stands on the box, near its centre."""
-        assert state.mocap_pos is not None
-        above = state.qpos[:, 2] - (state.mocap_pos[:, 0, 2] + BOX) > SUCCESS_HEIGHT
+        above = state.qpos[:, 2] - (state.mocap_place(0)[:, 2] + self.box) > SUCCESS_HEIGHT
         return above & (self._distance(state) < SUCCESS_DISTANCE) & ~self.fallen(state, LOWEST)
 
     def metrics(self) -> dict[str, float]:
         """Averages over about 500 training episodes, and the phase (0, 1, 2 for A, B, C)."""
-        return {**self.averages.values, "phase": float("ABC".index(self.phase))}
+        return {**self.curriculum.averages.numbers(), "phase": float(self._phase)}
 
     def state_dict(self) -> dict[str, Any]:
         """Phase and averages; levels are part of the state of the rows."""
-        return {"phase": self.phase, "averages": dict(self.averages.values)}
+        return {"phase": self.phase, "averages": self.curriculum.averages.numbers()}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
         phase, averages = checks.entries("saved", saved, "phase", "averages")
         checks.one_of("phase", phase, PHASES)
-        self.averages.load(averages)
-        if self.curriculum:  # without one it stays what was asked for
-            self.phase = phase
+        self.curriculum.averages.load(averages)
+        if self.curriculum.rising:  # without one it stays what was asked for
+            self._phase = PHASES.index(phase)
 
 
 def _axes() -> tuple[Tensor, Tensor]:

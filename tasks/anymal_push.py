@@ -12,16 +12,17 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from typing_extensions import Unpack  # of typing since Python 3.11
 
-from tasks.anymal import OBSERVATION_LIMIT, Anymal, into_base, rotation
-from tasks.base import Entry, register
-from tasks.curriculum import Averages, levels, next_level
+from tasks.anymal import Anymal, RobotArguments, into_base, rotation
+from tasks.base import register
+from tasks.curriculum import Curriculum
 from tasks.draws import draws
+from tasks.observation import Entry
 from tasks.state import State
 from torchrl_sym import Representation, checks
 from torchrl_sym.representations import invariant, polar
 
-CUBE = 0.3  # half its edge, m
 # Where the cube starts: distance from the robot, m, and how far a face is turned from it, rad.
 CUBE_DISTANCE, CUBE_TURN = (1.0, 1.3), 0.3
 # How far behind the cube the target is, m: 0.3 + 0.15 level U(0.5, 1), at most 1.35 at the last level.
@@ -81,22 +82,28 @@ class AnymalPush(Anymal):
     name = "anymal_push"
     asset = "anymal_push.xml"
     episode_seconds = 7.0
-    observation_size = 51
     goal_names = ("front left", "back left", "front right", "back right")
     task_terms = tuple(TASK_WEIGHTS)
 
-    def __init__(self, *, curriculum: bool = True, **robot: Any) -> None:
+    def __init__(self, *, curriculum: bool = True, **robot: Unpack[RobotArguments]) -> None:
         super().__init__(**robot)
-        self.curriculum = checks.flag("curriculum", curriculum)
-        self.averages = Averages("success", "level")
+        self.cube = float(self.model.geom("cube").size[0])  # half its edge, m
+        self.curriculum = Curriculum(LAST_LEVEL, "success", "level", rising=curriculum)
 
     def layout(self) -> tuple[Entry, ...]:
         """Proprioception, then where the cube is, and where it has to go."""
         position = polar(self.robot.group)
+
+        def cube(state: State) -> Tensor:
+            return into_base(rotation(state), state.qpos[:, 19:22] - state.qpos[:, 0:3])
+
+        def gap(state: State) -> Tensor:
+            return into_base(rotation(state), state.mocap_place(0) - state.qpos[:, 19:22])
+
         return (
             *self.proprioception(),
-            Entry("cube position", position, "m", "base", "polar vector", CUBE_SCALE),
-            Entry("from cube to target", position, "m", "base", "polar vector", GAP_SCALE),
+            Entry("cube position", cube, position, "m", "base", "polar vector", CUBE_SCALE),
+            Entry("from cube to target", gap, position, "m", "base", "polar vector", GAP_SCALE),
         )
 
     def variables(self) -> dict[str, Representation]:
@@ -106,27 +113,31 @@ class AnymalPush(Anymal):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """Cube and target in front on the left, at any distance of the curriculum."""
-        return self._start(levels(n, LAST_LEVEL), generator, spread=0.0)
+        return self._start(self.curriculum.hardest(n, generator), generator, spread=0.0)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """Any direction; near targets, or with ``curriculum=False`` the whole range."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        start = self._start(level, generator, spread=0.5 if self.curriculum else 0.0)
-        return self.mapped_at_random(start, generator)
+        return self._training_start(self.curriculum.start(n, generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: the next target is farther after success, nearer after no progress."""
-        level = finished.variables["level"][:, 0]
         distance, start = self._distance(finished), finished.variables["start_distance"][:, 0]
         over = finished.time > self.episode_seconds - self.control_timestep / 2
-        whole = over | self.fallen(finished, LOWEST)
-        success = whole & self.success(finished)
-        self.averages.update(success=success[whole], level=level[whole])
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        failure = whole & ~success & (distance > 0.7 * start)
-        level = next_level(level, success, failure, LAST_LEVEL, generator)
-        return self.mapped_at_random(self._start(level, generator, spread=0.5), generator)
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=over | self.fallen(finished, LOWEST),
+            success=self.success(finished),
+            failed=distance > 0.7 * start,
+            generator=generator,
+            rows=rows,
+        )
+        return self._training_start(level, generator)
+
+    def _training_start(self, level: Tensor, generator: torch.Generator | None) -> State:
+        spread = 0.5 if self.curriculum.rising else 0.0
+        return self.mapped_at_random(self._start(level, generator, spread), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None, spread: float) -> State:
         """Starts with the cube in front on the left and the target behind it.
@@ -145,13 +156,13 @@ class AnymalPush(Anymal):
         ray = torch.stack([bearing.cos(), bearing.sin()], dim=-1)
         distance = CUBE_DISTANCE[0] + (CUBE_DISTANCE[1] - CUBE_DISTANCE[0]) * u[:, 2]
         state.qpos[:, 19:21] = distance[:, None] * ray
-        state.qpos[:, 21] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        state.qpos[:, 21] = self.cube + 0.001  # exactly touching, rounding would decide which corners touch
         turn = bearing + (2 * u[:, 3] - 1) * CUBE_TURN
         state.qpos[:, 22], state.qpos[:, 25] = (turn / 2).cos(), (turn / 2).sin()
         reach = NEAREST_TARGET + TARGET_STEP * level * (spread + (1 - spread) * u[:, 4])
-        assert state.mocap_pos is not None
-        state.mocap_pos[:, 0, :2] = (distance + reach)[:, None] * ray
-        state.mocap_pos[:, 0, 2] = CUBE
+        target = state.mocap_place(0)
+        target[:, :2] = (distance + reach)[:, None] * ray
+        target[:, 2] = self.cube
         state.variables["distance"] = reach[:, None].clone()
         state.variables["start_distance"] = reach[:, None].clone()
         return state
@@ -162,22 +173,10 @@ class AnymalPush(Anymal):
 
     def _gap(self, state: State) -> Tensor:
         """From the cube to the target, horizontally, ``(n, 2)``, m."""
-        assert state.mocap_pos is not None
-        return state.mocap_pos[:, 0, :2] - state.qpos[:, 19:21]
+        return state.mocap_place(0)[:, :2] - state.qpos[:, 19:21]
 
     def _distance(self, state: State) -> Tensor:
         return state.shared("distance", lambda: self._gap(state).norm(dim=-1))
-
-    def observe(self, state: State) -> Tensor:
-        """Proprioception, cube, and from there to the target, in the base frame."""
-        assert state.mocap_pos is not None
-        observation = torch.empty(len(state), 51)
-        self.observe_robot(state, observation)
-        turn, base = rotation(state), state.qpos[:, 0:3]
-        cube = state.qpos[:, 19:22]
-        observation[:, 45:48] = into_base(turn, cube - base) * CUBE_SCALE
-        observation[:, 48:51] = into_base(turn, state.mocap_pos[:, 0] - cube) * GAP_SCALE
-        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Approach the cube from behind, move it to the target, hold it there; walk well."""
@@ -219,15 +218,15 @@ class AnymalPush(Anymal):
 
     def metrics(self) -> dict[str, float]:
         """Success rate and level, averaged over about the last 500 training episodes."""
-        return dict(self.averages.values)
+        return self.curriculum.averages.numbers()
 
     def state_dict(self) -> dict[str, Any]:
         """The averages; levels are part of the state of the rows."""
-        return {"averages": dict(self.averages.values)}
+        return {"averages": self.curriculum.averages.numbers()}
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.load(*checks.entries("saved", saved, "averages"))
+        self.curriculum.averages.load(*checks.entries("saved", saved, "averages"))
 
 
 def facing(turn: Tensor, toward: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """What a task is: one description in torch, batched, from which both faces are made.
 
-A task says how a robot problem looks (observe), what is good (reward_terms), when it is over
+A task says how a robot problem looks (layout), what is good (reward_terms), when it is over
 (terminated), how it starts (sample_goal_state) and how its symmetry group acts on its full state
 (transform_state). It holds no simulation: every method is a function of a `State` of n rows. The
 batched TorchRL environment (environment.py) and the dm_control environment (suite.py) call the same
@@ -17,7 +17,6 @@ import importlib.resources
 import inspect
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
 import mujoco
@@ -25,7 +24,9 @@ import torch
 from torch import Tensor
 from typing_extensions import Self  # of typing since Python 3.11
 
-from tasks.draws import check_generator
+from tasks.constants import Constant
+from tasks.draws import device_of, put
+from tasks.observation import Entry, Observation
 from tasks.simulation import Simulation
 from tasks.state import Element, State, concatenate
 from torchrl_sym import PointGroup, Representation, Symmetry, checks
@@ -39,49 +40,24 @@ _TASKS: dict[str, type[Task]] = {}
 T = TypeVar("T", bound="type[Task]")
 
 
-@dataclass(frozen=True)
-class Entry:
-    """A block of the observation: the layout of a task is a tuple of these, in order.
-
-    Attributes:
-        name: what it is.
-        representation: how the group acts on it; its ``dim`` is the block's size.
-        unit: of the physical quantity.
-        frame: in which frame it is measured.
-        kind: how it transforms, in words.
-        scale: what the quantity is multiplied by.
-    """
-
-    name: str
-    representation: Representation
-    unit: str
-    frame: str
-    kind: str
-    scale: float = 1.0
-
-    def __post_init__(self) -> None:
-        checks.instance("representation", self.representation, Representation)
-        checks.real("scale", self.scale)
-        for name in ("name", "unit", "frame", "kind"):
-            checks.instance(name, getattr(self, name), str)
-
-
 class Task(abc.ABC):
     """Description of one robot task; subclass it, decorate the class with :func:`register`.
 
     Class attributes a task sets: ``name``; ``asset`` (its file in tasks/assets);
-    ``control_timestep`` [s]; ``episode_seconds`` [s]; ``observation_size``; ``action_size``;
+    ``control_timestep`` [s]; ``episode_seconds`` [s];
     ``goal_names``, one per group element in the group's order; ``carried``, names of objects whose
     orientation the group only carries along (:func:`~torchrl_sym.mujoco.derive`); ``task_terms``, names
-    of the reward's terms that are the task itself rather than gait or effort; and if 1000 is not right,
-    ``max_velocity`` (m/s or rad/s) above which a simulation counts as diverged.
+    of the reward's terms that are the task itself rather than gait or effort; ``observation_limit``, beyond
+    which observations are cut off; and if 1000 is not right, ``max_velocity`` (m/s or rad/s) above which a
+    simulation counts as diverged.
 
     The group acts on three things that must agree: observations and actions (``symmetry``) and the
     full state (:meth:`transform_state`). Then for every element g, with L_g and K_g of the paper::
 
         T(L_g s, K_g a) = L_g T(s, a),  r(L_g s, K_g a) = r(s, a),  observe(L_g s) = L_g observe(s)
 
-    All of it is derived from the model: a task states its :meth:`layout` in terms of ``robot``.
+    All of it is derived from the model: a task states every entry of its observation once, in
+    :meth:`layout`, in terms of ``robot``; what is observed, its size and its symmetry follow.
 
     Args:
         group: the group that acts, about the vertical axis through the world's origin.
@@ -93,6 +69,8 @@ class Task(abc.ABC):
         robot: the symmetry derived from it.
         arguments: what the task was made with, by name.
         symmetry: how the group acts on observation and action.
+        observation_size: numbers observed.
+        action_size: numbers in an action, one per actuator.
 
     Example:
         >>> from tasks.base import create
@@ -105,11 +83,10 @@ class Task(abc.ABC):
     asset: ClassVar[str]
     control_timestep: ClassVar[float]
     episode_seconds: float
-    observation_size: ClassVar[int]
-    action_size: ClassVar[int]
     goal_names: ClassVar[tuple[str, ...]]
     carried: ClassVar[tuple[str, ...]] = ()
     task_terms: ClassVar[tuple[str, ...]] = ()
+    observation_limit: ClassVar[float | None] = None
     max_velocity: float = 1000.0
     arguments: dict[str, Any]
 
@@ -137,16 +114,26 @@ class Task(abc.ABC):
                 f"expected a control_timestep that is a multiple of the model's timestep "
                 f"{timestep} s, got {self.control_timestep} s; change one of the two"
             )
+        self._friction = Constant(self.model.geom_friction[:, 0])
         self.robot = derive(self.model, group, carried=self.carried)
-        parts = [entry.representation for entry in self.layout()]
+        self._observation = Observation(self.layout(), self.observation_limit)
         self.symmetry = Symmetry(
-            group, {"observation": sum(parts[1:], parts[0]), "action": self.robot.actuators}
+            group, {"observation": self._observation.representation, "action": self.robot.actuators}
         )
+        self.observation_size = self.symmetry["observation"].dim
+        self.action_size = self.symmetry["action"].dim
         self._variables = self.variables()
+
+    def __getstate__(self) -> dict[str, Any]:  # functions in the layout need not be picklable
+        return {name: value for name, value in vars(self).items() if name != "_observation"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._observation = Observation(self.layout(), self.observation_limit)
 
     @abc.abstractmethod
     def layout(self) -> tuple[Entry, ...]:
-        """The blocks of the observation, in order."""
+        """The blocks of the observation, in order: the only place that says what is observed."""
 
     def variables(self) -> dict[str, Representation]:
         """How the group acts on each of the task's own variables, ``(n, dim)``; none by default."""
@@ -188,17 +175,23 @@ class Task(abc.ABC):
 
     def mapped_at_random(self, state: State, generator: torch.Generator | None) -> State:
         """Every row mapped by a uniformly drawn element: makes any distribution exactly symmetric."""
-        check_generator(generator)
+        device_of(generator)
         rows = len(checks.instance("state", state, State))
-        element = torch.randint(self.symmetry.group.order, (rows,), generator=generator)
+        order, device = self.symmetry.group.order, state.qpos.device
+        element = torch.randint(order, (rows,), generator=generator, device=device)
         return self.transform_state(state, element)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Start states for rows whose episode is over; a curriculum judges ``finished`` here.
 
         Args:
             finished: the last state of these rows; ``finished.time`` is 0 where no step was made.
             generator: the environment's generator; draw from nothing else.
+            rows: on a device, where to know how many rows are over is a stop, ``finished`` is the state of
+                all n, and this a mask ``(n,)`` of those that are over: starts of the others are not used,
+                and a curriculum must not judge them. None: all are over.
         """
         return self.sample_initial_state(len(finished), generator)
 
@@ -209,12 +202,17 @@ class Task(abc.ABC):
 
         Draw values whose distribution the group maps onto itself, or the task stops being
         symmetric.
+
+        Args:
+            simulation: the engine, whose fields are written to.
+            ids: k row numbers; on a device, a mask of all n rows. Draw ``len(ids)`` values, and write them
+                by :func:`tasks.draws.put`, which takes both.
+            generator: the environment's generator; draw from nothing else.
         """
 
     def scale_friction(self, simulation: Simulation, ids: Tensor, factor: Tensor) -> None:
-        """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(k,)``."""
-        own = torch.from_numpy(self.model.geom_friction[:, 0].copy())
-        simulation.expand("geom_friction")[ids, :, 0] = factor[:, None] * own
+        """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(len(ids),)``."""
+        put(simulation.expand("geom_friction")[..., 0], ids, factor[:, None] * self._friction.like(factor))
 
     @abc.abstractmethod
     def control(self, action: Tensor, state: State) -> Tensor:
@@ -228,9 +226,18 @@ class Task(abc.ABC):
         """
         return {}
 
-    @abc.abstractmethod
     def observe(self, state: State) -> Tensor:
-        """Observation, a new tensor of shape ``(n, observation_size)``, float32 or float64."""
+        """Observation, a new tensor of shape ``(n, observation_size)``, float32: the layout's entries."""
+        return self._observation(state)
+
+    def check_observation(self, state: State) -> None:
+        """ValueError unless what is observed in a state has the sizes that the layout says."""
+        self._observation.check(state)
+        if (shape := tuple(self.observe(state).shape)) != (len(state), self.observation_size):
+            raise ValueError(
+                f"observation: expected {self.observation_size} numbers a row, as the layout of task "
+                f"{self.name!r} says, got shape {shape}; leave observe() as it is, or correct the layout"
+            )
 
     @abc.abstractmethod
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:

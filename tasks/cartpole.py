@@ -19,8 +19,9 @@ import math
 import torch
 from torch import Tensor
 
-from tasks.base import Entry, Task, register
+from tasks.base import Task, register
 from tasks.draws import draws
+from tasks.observation import Entry
 from tasks.state import State
 from torchrl_sym import PointGroup, checks
 
@@ -28,8 +29,7 @@ from torchrl_sym import PointGroup, checks
 MAX_CART_VELOCITY = 3.0
 # What the observation is divided by, so that its entries are about 1: the velocities of cart (m/s)
 # and pole (rad/s), and the pole's angle (rad).
-VELOCITY_SCALE = (3.0, 10.0)
-ANGLE_SCALE = math.pi
+CART_RANGE, POLE_RANGE, ANGLE_RANGE = 3.0, 10.0, math.pi
 # The pole starts flat: angle from upright, rad.
 START_ANGLE = math.pi / 2
 # Half-width of the uniform noise on the start angle (rad) and on both velocities (m/s, rad/s).
@@ -66,8 +66,6 @@ class CartPole(Task):
     asset = "cartpole.xml"
     control_timestep = 0.02
     episode_seconds = 4.0
-    observation_size = 3
-    action_size = 1
     goal_names = ("right", "left")
     task_terms = ("angle",)
 
@@ -91,23 +89,34 @@ class CartPole(Task):
             option.gravity[:] = weight * math.sin(slope), 0.0, -weight * math.cos(slope)
         if wind:
             option.wind[:], option.density = (wind, 0.0, 0.0), AIR_DENSITY
-        self._velocity_scale = torch.tensor(VELOCITY_SCALE, dtype=torch.float64)
 
     def layout(self) -> tuple[Entry, ...]:
-        """Cart velocity, pole angle, pole velocity."""
+        """Cart velocity, pole angle, pole velocity.
+
+        The cart's position is left out: the rail has no end, so nothing depends on it.
+        """
         cart, pole = (self.robot.joints([name]) for name in ("slide", "hinge"))
         joint = "sign of its joint"
         return (
-            Entry("cart velocity", cart, "m/s", "world", joint, 1 / VELOCITY_SCALE[0]),
-            Entry("pole angle from upright", pole, "rad", "world", joint, 1 / ANGLE_SCALE),
-            Entry("pole velocity", pole, "rad/s", "world", joint, 1 / VELOCITY_SCALE[1]),
-        )
+            Entry(
+                "cart velocity", lambda state: state.qvel[:, :1],
+                cart, "m/s", "world", joint, divisor=CART_RANGE,
+            ),
+            Entry(
+                "pole angle from upright", lambda state: _angle(state)[:, None],
+                pole, "rad", "world", joint, divisor=ANGLE_RANGE,
+            ),
+            Entry(
+                "pole velocity", lambda state: state.qvel[:, 1:],
+                pole, "rad/s", "world", joint, divisor=POLE_RANGE,
+            ),
+        )  # fmt: skip
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The pole lies flat to the right; noise on its angle and on both velocities."""
         noise = draws(n, 3, generator) * 2 - 1
         noise *= START_NOISE
-        qpos = torch.zeros(len(noise), 2, dtype=torch.float64)
+        qpos = noise.new_zeros(len(noise), 2)
         qpos[:, 1] = START_ANGLE + noise[:, 0]
         return State(qpos=qpos, qvel=noise[:, 1:])
 
@@ -115,23 +124,13 @@ class CartPole(Task):
         """Desired cart velocity, m/s."""
         return action.clamp(-1.0, 1.0).mul_(MAX_CART_VELOCITY).add_(self.motor_bias)
 
-    def observe(self, state: State) -> Tensor:
-        """Cart velocity, pole angle and pole velocity, each over its scale.
-
-        The cart's position is left out: the rail has no end, so nothing depends on it.
-        """
-        observation = torch.empty(len(state), 3)
-        torch.div(state.qvel, self._velocity_scale, out=observation[:, ::2])
-        torch.div(_angle(state), ANGLE_SCALE, out=observation[:, 1])
-        return observation
-
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Minus the pole's distance from upright, over the time of the step, rad s."""
         return {"angle": _angle(state).abs().mul_(-self.control_timestep)}
 
 
 def _angle(state: State) -> Tensor:
-    """Pole angle from upright, in [-pi, pi], rad."""
+    """Pole angle from upright, in [-pi, pi], ``(n,)``, rad."""
     return state.shared("angle", lambda: _wrap(state.qpos[:, 1]))
 
 

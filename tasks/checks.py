@@ -16,8 +16,8 @@ from torch import Tensor
 from tasks.state import State
 
 
-def action_of(tensordict: TensorDictBase, shape: torch.Size) -> Tensor:
-    """The actions of a step, of floating point and of this shape, on the CPU and without gradient.
+def action_of(tensordict: TensorDictBase, shape: torch.Size, device: torch.device) -> Tensor:
+    """The actions of a step, of floating point and of this shape, on a device and without gradient.
 
     Raises:
         KeyError: there are none.
@@ -40,13 +40,13 @@ def action_of(tensordict: TensorDictBase, shape: torch.Size) -> Tensor:
             f"action: expected shape {tuple(shape)} (num_envs, action_size), got {tuple(action.shape)}; "
             "check the policy's last layer"
         )
-    if action.requires_grad or not action.is_cpu:
-        action = action.detach().cpu()
+    if action.requires_grad or action.device != device:
+        action = action.detach().to(device)
     return action
 
 
-def rows_of(name: str, mask: Tensor, num_envs: int) -> Tensor:
-    """A mask of rows as ``(num_envs,)`` bool on the CPU.
+def rows_of(name: str, mask: Tensor, num_envs: int, device: torch.device) -> Tensor:
+    """A mask of rows as ``(num_envs,)`` bool on a device.
 
     Raises:
         ValueError: another shape or type.
@@ -56,10 +56,10 @@ def rows_of(name: str, mask: Tensor, num_envs: int) -> Tensor:
             f"{name}: expected a bool mask of shape ({num_envs}, 1), one per simulation, got {mask.dtype} "
             f"of shape {tuple(mask.shape)}"
         )
-    return mask.reshape(-1).cpu()
+    return mask.reshape(-1).to(device)
 
 
-def check_start(start: State, own: Mapping[str, Tensor], rows: int) -> None:
+def check_start(start: State, own: Mapping[str, Tensor], rows: int, *, finite: bool = True) -> None:
     """Refuse a start whose time or task variables would be kept, broadcast or spread silently.
 
     Positions and velocities are checked where they are written (``Simulation.write``).
@@ -68,6 +68,7 @@ def check_start(start: State, own: Mapping[str, Tensor], rows: int) -> None:
         start: what an episode is to start from.
         own: the variables of the task, ``(n, ...)`` each.
         rows: how many rows are started.
+        finite: look at the numbers too, for which a device is waited for.
 
     Raises:
         TypeError: not a :class:`~tasks.state.State`.
@@ -87,13 +88,14 @@ def check_start(start: State, own: Mapping[str, Tensor], rows: int) -> None:
         )
     for name, value in start.variables.items():
         expected = (rows, *own[name].shape[1:])
-        if not isinstance(value, Tensor) or value.shape != expected or not bool(value.isfinite().all()):
+        alike = isinstance(value, Tensor) and value.shape == expected
+        if not alike or (finite and not bool(value.isfinite().all())):
             shape = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
             raise ValueError(
                 f"expected a finite tensor of shape {expected} for the variable {name!r}, got {shape}, or "
                 "numbers that are not finite; check how the start states are made"
             )
-    if start.time is not None and bool((start.time < 0).any()):
+    if finite and start.time is not None and bool((start.time < 0).any()):
         raise ValueError(
             f"expected a time of at least 0 s since the episode began, got {float(start.time.min())} s; "
             "leave it out for an episode that begins"

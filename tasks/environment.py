@@ -4,6 +4,11 @@
 environments: it never resets itself (the true last observation of an episode is under "next", so
 that time-outs can be bootstrapped), resets any subset of rows, and can be saved and continued bit
 for bit.
+
+Where the physics runs on a device, the host asks it nothing during a step or a reset, since to ask is to
+wait: rows are masks there instead of numbers, start states are drawn for all rows and taken by those of the
+mask, and what may have happened (an action that is not finite, a simulation that diverged) is treated as
+if it had, by arithmetic that changes nothing where it has not. On the CPU asking is cheaper.
 """
 
 from __future__ import annotations
@@ -14,13 +19,15 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from tasks.base import Task, create
+from tasks.base import Task
 from tasks.checks import action_of, check_saved, check_start, rows_of
+from tasks.draws import put
+from tasks.engines import EngineName, make_engine
 from tasks.processes import Generator, by_value, from_value
 from tasks.simulation import Simulation
+from tasks.specs import make_specs
 from tasks.state import State
 from torchrl_sym import checks
 
@@ -44,19 +51,23 @@ class BatchedEnv(EnvBase):
     Args:
         task: the description.
         num_envs: number of simulations n.
-        num_threads: physics threads, 0 for all cores; does not change the results.
+        num_threads: physics threads on the CPU, 0 for all cores; does not change the results.
         seed: seed of all start states. Defaults to a draw from torch's global generator.
-        device: where tensors go; the physics runs on the CPU. Defaults to the CPU.
+        device: where tensors go. Defaults to the CPU.
+        engine: what steps the simulations: ``"mujoco"``, on CPU threads, or ``"warp"``, on the device. None
+            for ``"warp"`` on CUDA, else ``"mujoco"``.
 
     Attributes:
         task: the description.
         symmetry: the task's :class:`~torchrl_sym.Symmetry`.
         simulation: the physics.
-        num_diverged: simulations that diverged since construction.
+        engine: what it was asked to be.
+        num_diverged: simulations that diverged since construction; on a device, a number there.
 
     Raises:
         TypeError: not a task, or a number of another type.
         ValueError: a number out of range, or a task that contradicts itself.
+        ImportError: the physics on a GPU is not installed.
 
     Example:
         >>> from tasks.base import create
@@ -73,6 +84,7 @@ class BatchedEnv(EnvBase):
         num_threads: int = 2,
         seed: int | None = None,
         device: torch.device | str | None = None,
+        engine: EngineName | None = None,
     ) -> None:
         if not isinstance(task, Task):
             raise TypeError(
@@ -80,21 +92,30 @@ class BatchedEnv(EnvBase):
             )
         if seed is not None:  # before the physics is made
             seed = checks.whole("seed", seed, 0, MAX_SEED)
-        simulation = Simulation(task.model, num_envs, num_threads, max_velocity=task.max_velocity)
-        super().__init__(device=device, batch_size=torch.Size([num_envs]))
+        simulation = make_engine(task, num_envs, num_threads=num_threads, device=device, engine=engine)
+        asks = isinstance(simulation, Simulation)
+        place = simulation.qpos.device
+        super().__init__(device=device if asks else place, batch_size=torch.Size([num_envs]))
         self.task = task
         self.simulation = simulation
-        self.num_diverged = 0
-        self._generator = Generator()
-        self._make_specs()
-        self._check_task()
+        self.engine = engine
+        self.num_diverged: Any = 0
+        self._asks = asks  # whether to ask what happened costs nothing
+        self._place = place  # of the physics; a task computes there too
+        self._generator = Generator(place)
+        self._action_shape = torch.Size((num_envs, task.action_size))
+        specs = make_specs(task, num_envs, self.device)
+        self.observation_spec, self.action_spec, self.reward_spec, self.full_done_spec = specs
         self._substeps = task.substeps
         # Time adds up rounding errors; half a control step is far above them.
         self._time_limit = (task.max_steps - 0.5) * task.control_timestep
         start = task.sample_initial_state(1, torch.Generator().manual_seed(0))
-        variables = {name: x.new_zeros(num_envs, *x.shape[1:]) for name, x in start.variables.items()}
-        self._state = self._state_with(variables)
-        self._over = torch.zeros(num_envs, dtype=torch.bool)  # rows whose episode has ended
+        self._check_task(start)
+        like = {"dtype": None if asks else simulation.qpos.dtype, "device": place}
+        self._state = self._state_with(
+            {name: x.new_zeros(num_envs, *x.shape[1:], **like) for name, x in start.variables.items()}
+        )
+        self._over = torch.zeros(num_envs, dtype=torch.bool, device=place)  # rows whose episode has ended
         self._started = False
         self._restored = False
         self._stagger = False
@@ -111,7 +132,7 @@ class BatchedEnv(EnvBase):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         super().__setstate__(state)
-        self._state = self._state_with(from_value(state["_state"]))
+        self._state = self._state_with(from_value(state["_state"], self._place))
 
     @property
     def symmetry(self):
@@ -123,24 +144,7 @@ class BatchedEnv(EnvBase):
         """A copy of the full state of all rows."""
         return self._state.clone()
 
-    def _make_specs(self) -> None:
-        (n,) = self.batch_size
-        task = self.task
-
-        real: dict[str, Any] = {"dtype": torch.float32, "device": self.device}
-
-        def flag() -> Binary:
-            return Binary(1, shape=torch.Size((n, 1)), dtype=torch.bool, device=self.device)
-
-        self.observation_spec = Composite(
-            observation=Unbounded(torch.Size((n, task.observation_size)), **real), shape=(n,)
-        )
-        self._action_shape = torch.Size((n, task.action_size))
-        self.action_spec = Bounded(-1.0, 1.0, shape=self._action_shape, **real)
-        self.reward_spec = Unbounded(torch.Size((n, 1)), **real)
-        self.full_done_spec = Composite(done=flag(), terminated=flag(), truncated=flag(), shape=(n,))
-
-    def _check_task(self) -> None:
+    def _check_task(self, start: State) -> None:
         """Sizes, boxes and goals agree with the symmetry: better now than after a night's training."""
         group, names = self.task.symmetry.group, self.task.goal_names
         if len(names) != group.order:
@@ -149,6 +153,7 @@ class BatchedEnv(EnvBase):
                 f"correct goal_names of task {self.task.name!r}"
             )
         self.task.symmetry.check_specs(self)
+        self.task.check_observation(start)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
@@ -161,9 +166,9 @@ class BatchedEnv(EnvBase):
             raise RuntimeError("expected a started episode, got none; call reset() first")
         self._restored = False
         task, state, simulation = self.task, self._state, self.simulation
-        action = action_of(tensordict, self._action_shape)
+        action = action_of(tensordict, self._action_shape, self._place)
         lost = None
-        if not math.isfinite(float(action.sum())):
+        if not (self._asks and math.isfinite(float(action.sum()))):
             lost = ~action.isfinite().all(dim=-1, keepdim=True)
             action = action.masked_fill(lost, 0.0)
         ctrl = task.control(action, state)
@@ -171,17 +176,21 @@ class BatchedEnv(EnvBase):
             ctrl = ctrl.masked_fill(lost, math.nan)  # which the simulation reports
         active = tensordict.get("_step", None)  # TorchRL skips rows that are done in some rollouts
         if active is not None:
-            active = rows_of("_step", active, len(state))
+            active = rows_of("_step", active, len(state), self._place)
         diverged = None
         if simulation.step(ctrl, self._substeps, active):
             diverged = simulation.diverged()
-            self.num_diverged += int(diverged.sum())
+            count = diverged.sum()
+            self.num_diverged = self.num_diverged + (int(count) if self._asks else count)
             action = action.masked_fill(diverged[:, None], 0.0)
         state.hold()
         reward = task.reward(state, action)
         for name, value in task.update(state, action).items():
-            rows = slice(None) if active is None else active
-            state.variables[name][rows] = value[rows].to(state.variables[name].dtype)
+            own = state.variables[name]
+            if active is None:
+                own.copy_(value)
+            else:
+                put(own, active, value)
         truncated = state.time > self._time_limit
         terminated = task.terminated(state)
         if diverged is not None:
@@ -210,23 +219,34 @@ class BatchedEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        rows = torch.ones_like(self._over) if mask is None else rows_of("_reset", mask, len(self._over))
-        if self._restored and bool(rows.all()):
-            rows = self._over.clone()  # continue: only episodes that had ended when saved begin anew
-        self._restored = False
-        ids = rows.nonzero().squeeze(-1)
-        if len(ids):
-            if self._started:
-                start = self.task.restart(self._state.rows(ids), self._generator)
-            else:
-                start = self.task.sample_initial_state(len(ids), self._generator)
-            self._write(ids, start)
-            self.task.randomize(self.simulation, ids, self._generator)
-        if self._stagger and len(ids) == len(rows):
+        over = self._over
+        rows = torch.ones_like(over) if mask is None else rows_of("_reset", mask, len(over), self._place)
+        continued, self._restored = self._restored and bool(rows.all()), False
+        if continued:  # only episodes that had ended when saved begin anew
+            rows = over.clone()
+        if not continued or bool(rows.any()):  # or a device would draw starts that nobody takes
+            self._begin(rows)
+        if self._stagger and bool(rows.all()):
             self._stagger = False
-            steps = torch.randint(self.task.max_steps, rows.shape, generator=self._generator)
+            draw = {"generator": self._generator, "device": self._place}
+            steps = torch.randint(self.task.max_steps, rows.shape, **draw)
             self._state.time[:] = steps * self.task.control_timestep
         return self._first_output()
+
+    def _begin(self, rows: Tensor) -> None:
+        """Start episodes of the rows of a mask; which they are is asked only where that costs nothing."""
+        task, generator = self.task, self._generator
+        ids = rows.nonzero().squeeze(-1) if self._asks else rows
+        if not len(ids):
+            return
+        if not self._started:
+            start = task.sample_initial_state(len(ids), generator)
+        elif self._asks:
+            start = task.restart(self._state.rows(ids), generator)
+        else:
+            start = task.restart(self._state, generator, rows)
+        self._write(ids, start, finite=self._asks)
+        task.randomize(self.simulation, ids, generator)
 
     def stagger(self) -> None:
         """Start every row of the next full reset at a random time of its episode.
@@ -266,21 +286,24 @@ class BatchedEnv(EnvBase):
             >>> bool((left["observation"] == -env.reset_to(start)["observation"]).all())
             True
         """
-        self._write(torch.arange(*self.batch_size), state)
+        if not self._asks and isinstance(state, State):
+            state = state.to(self._place)
+        self._write(torch.arange(*self.batch_size) if self._asks else torch.ones_like(self._over), state)
         self._restored = False
         return self._first_output()
 
-    def _write(self, ids: Tensor, start: State) -> None:
+    def _write(self, ids: Tensor, start: State, *, finite: bool = True) -> None:
         own = self._state.variables
-        check_start(start, own, len(ids))
+        check_start(start, own, len(ids), finite=finite)
         self.simulation.write(ids, start.qpos, start.qvel, start.mocap_pos, start.mocap_quat, start.time)
         for name, value in start.variables.items():
-            own[name][ids] = value.to(own[name].dtype)
+            put(own[name], ids, value)
         self._started = True
-        self._over = self._over.index_fill(0, ids, False)  # not in place: outputs may share it
+        # not in place: outputs may share it
+        self._over = self._over.index_fill(0, ids, False) if self._asks else self._over & ~ids
 
     def _first_output(self) -> TensorDict:
-        flags = torch.zeros(3, *self.batch_size, 1, dtype=torch.bool)
+        flags = torch.zeros(3, *self.batch_size, 1, dtype=torch.bool, device=self._place)
         self._state.release()
         return self._output(
             observation=self.task.observe(self._state).to(torch.float32),
@@ -316,7 +339,7 @@ class BatchedEnv(EnvBase):
             "over": self._over.clone(),
             "started": self._started,
             "generator": self._generator.get_state(),
-            "num_diverged": self.num_diverged,
+            "num_diverged": int(self.num_diverged),
             "task": self.task.state_dict(),
         }
 
@@ -342,7 +365,7 @@ class BatchedEnv(EnvBase):
         """
         self._check_saved(saved)
         try:
-            self._generator.set_state(saved["generator"])
+            self._generator.set_state(saved["generator"].cpu())
             self.task.load_state_dict(saved["task"])
         except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
             raise ValueError(
@@ -350,8 +373,9 @@ class BatchedEnv(EnvBase):
                 f"({type(error).__name__}: {error}); restore what save_state() returned"
             ) from error
         self.simulation.load(saved["simulation"])
-        self._state.variables = {name: x.clone() for name, x in saved["variables"].items()}
-        self._over = saved["over"].clone()
+        own = self._place
+        self._state.variables = {name: x.to(own, copy=True) for name, x in saved["variables"].items()}
+        self._over = saved["over"].to(own, copy=True)
         self._started = saved["started"]
         self.num_diverged = saved["num_diverged"]
         self._restored = self._started
@@ -362,36 +386,3 @@ class BatchedEnv(EnvBase):
             own |= {key: saved[key] for key in ("simulation", "task") if isinstance(saved.get(key), dict)}
         check_saved(saved, own)
         self.simulation.check(saved["simulation"])
-
-
-def make_env(
-    name: str,
-    *,
-    num_envs: int = 64,
-    num_threads: int = 2,
-    seed: int | None = None,
-    device: torch.device | str | None = None,
-    **task_kwargs: Any,
-) -> BatchedEnv:
-    """Batched TorchRL environment of a task, by name.
-
-    Args:
-        name: one of ``tasks.ALL_TASKS``.
-        num_envs: number of simulations.
-        num_threads: physics threads, 0 for all cores; does not change the results.
-        seed: seed of all start states. Defaults to a draw from torch's global generator.
-        device: where tensors go; the physics runs on the CPU. Defaults to the CPU.
-        **task_kwargs: arguments of the task, such as ``episode_seconds``.
-
-    Raises:
-        KeyError: no such task; the message lists the names.
-        TypeError: an argument that the task does not take.
-
-    Example:
-        >>> import tasks
-        >>> env = tasks.make_env("cartpole", num_envs=16, num_threads=1, seed=0)
-        >>> env.reset()["observation"].shape
-        torch.Size([16, 3])
-    """
-    task = create(name, **task_kwargs)
-    return BatchedEnv(task, num_envs, num_threads=num_threads, seed=seed, device=device)

@@ -139,9 +139,9 @@ def evaluate(
         (('right', 'left'), 0.0, None)
     """
     if isinstance(env, str):
-        task, device = create(env), None
+        task, where = create(env), {}
     elif isinstance(env, BatchedEnv):
-        task, device = env.task, env.device
+        task, where = env.task, {"device": env.device, "engine": env.engine}
     else:
         raise TypeError(
             f"expected a BatchedEnv or a task name, got {type(env).__name__}; pass the base "
@@ -157,7 +157,7 @@ def evaluate(
     order = task.symmetry.group.order
     generator = torch.Generator().manual_seed(seed)
     starts = task.sample_goal_states(episodes, generator)
-    batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, device=device)
+    batched = BatchedEnv(task, order * episodes, num_threads=num_threads, seed=seed, **where)
     # Streams of their own, so that neither moves the starts.
     noise_seed, physics_seed = torch.randint(2**31, (2,), generator=generator).tolist()
     draw_paired_physics(batched, physics_seed)
@@ -166,12 +166,12 @@ def evaluate(
     shape = (order, episodes)
 
     def by_goal(totals: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {name: x.reshape(shape).mean(dim=1) for name, x in totals.items()}
+        return {name: x.reshape(shape).mean(dim=1).cpu() for name, x in totals.items()}
 
     return Evaluation(
         task.goal_names,
         returns.reshape(shape).cpu(),
-        None if successes is None else successes.reshape(shape),
+        None if successes is None else successes.reshape(shape).cpu(),
         by_goal(terms),
         task.task_terms,
         by_goal(behaviour),
@@ -211,20 +211,21 @@ def _run(
     successes = task.success(env.state)  # every entry is replaced where its episode ends
     terms: dict[str, Tensor] = {}
     behaviour: dict[str, Tensor] = {}
+    place = env.simulation.qpos.device  # of the physics and of what the task computes
     while bool(running.any()):
         before = env.state.variables
         tensordict = env.step(policy(tensordict))
-        counted = running.squeeze(-1).cpu() & ~env.simulation.diverged()
+        counted = running.squeeze(-1).to(place) & ~env.simulation.diverged()
         returns += tensordict["next", "reward"].double() * running
         ended = running & tensordict["next", "done"]
         state = env.state
         if successes is not None and bool(ended.any()):
             reached = task.success(state)
             assert reached is not None
-            successes = torch.where(ended.squeeze(-1).cpu(), reached & counted, successes)
+            successes = torch.where(ended.squeeze(-1).to(place), reached & counted, successes)
         state.variables = before  # the reward sees the variables from before the step
         for totals, step in (
-            (terms, task.reward_terms(state, tensordict["action"].cpu())),
+            (terms, task.reward_terms(state, tensordict["action"].to(place))),
             (behaviour, task.behaviour(state)),
         ):
             for name, value in step.items():

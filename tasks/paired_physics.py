@@ -53,10 +53,11 @@ def draw_paired_physics(env: BatchedEnv, seed: int) -> None:
         (True, 2)
     """
     task, order = env.task, env.task.symmetry.group.order
-    for rows in torch.arange(env.batch_size[0]).reshape(order, -1):
-        task.randomize(env.simulation, rows, torch.Generator().manual_seed(seed))
+    place = env.simulation.qpos.device
+    for rows in torch.arange(env.batch_size[0], device=place).reshape(order, -1):
+        task.randomize(env.simulation, rows, torch.Generator(place).manual_seed(seed))
     drawn = {
-        key.removeprefix("model."): values.reshape(order, -1, *values.shape[1:])
+        key.removeprefix("model."): values.cpu().reshape(order, -1, *values.shape[1:])
         for key, values in env.simulation.save().items()
         if key.startswith("model.")
     }
@@ -73,7 +74,7 @@ def draw_paired_physics(env: BatchedEnv, seed: int) -> None:
 
 def _nominal(task: Task, name: str, values: Tensor) -> bool:
     own = getattr(task.model, name, None)  # None for `opt.gravity` and the like
-    return own is not None and bool((values == torch.from_numpy(own.copy())).all())
+    return own is not None and bool((values == torch.from_numpy(own.copy()).to(values.dtype)).all())
 
 
 def _check(task: Task, drawn: dict[str, Tensor]) -> None:

@@ -92,16 +92,16 @@ def refuse_forked_rendering() -> None:
 
 def by_value(tensors: Mapping[str, Tensor]) -> dict[str, np.ndarray]:
     """Tensors as arrays, which no pickle shares; back by :func:`from_value`."""
-    return {name: x.numpy() for name, x in tensors.items()}
+    return {name: x.numpy(force=x.device.type != "cpu") for name, x in tensors.items()}
 
 
-def from_value(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+def from_value(arrays: Mapping[str, np.ndarray], device: torch.device | None = None) -> dict[str, Tensor]:
     """The tensors of :func:`by_value`, in memory of their own."""
-    return {name: torch.tensor(x) for name, x in arrays.items()}
+    return {name: torch.tensor(x, device=device) for name, x in arrays.items()}
 
 
 class Generator(torch.Generator):
-    """A random generator that is pickled by value.
+    """A random generator, on any device, that is pickled by value.
 
     Example:
         >>> import pickle
@@ -112,10 +112,10 @@ class Generator(torch.Generator):
     """
 
     def __reduce__(self) -> Any:
-        return _generator, (self.get_state().numpy(),)
+        return _generator, (self.get_state().numpy(), str(self.device))
 
 
-def _generator(state: np.ndarray) -> Generator:
-    generator = Generator()
+def _generator(state: np.ndarray, device: str) -> Generator:
+    generator = Generator(device)
     generator.set_state(torch.tensor(state))
     return generator

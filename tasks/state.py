@@ -54,7 +54,7 @@ class State:
     def __post_init__(self) -> None:
         n = _rows("qpos", self.qpos, 2)
         if self.time is None:
-            self.time = torch.zeros(n, dtype=torch.float64)
+            self.time = torch.zeros(n, dtype=torch.float64, device=self.qpos.device)
         _rows("qvel", self.qvel, 2, n)
         _rows("time", self.time, 1, n)
         if self.mocap_pos is not None:
@@ -69,6 +69,18 @@ class State:
                 or len(value) != n
             ):
                 raise ValueError(f"variable {name!r}: expected {n} rows by name, got {checks.shown(value)}")
+
+    def mocap_place(self, body: int) -> Tensor:
+        """Position of a mocap body, by its number, ``(n, 3)``, m; the live tensor.
+
+        Raises:
+            ValueError: the state says nothing of mocap bodies.
+        """
+        return _given("mocap_pos", self.mocap_pos)[:, body]
+
+    def mocap_turn(self, body: int) -> Tensor:
+        """Orientation of a mocap body, by its number, ``(n, 4)``; see :meth:`mocap_place`."""
+        return _given("mocap_quat", self.mocap_quat)[:, body]
 
     def shared(self, name: str, compute: Callable[[], Tensor]) -> Tensor:
         """A quantity that reward, termination and observation of one step all need.
@@ -107,6 +119,10 @@ class State:
         """A copy that shares no memory with the simulation."""
         return self._map(Tensor.clone)
 
+    def to(self, device: torch.device) -> State:
+        """The same on a device; what is there already is not copied."""
+        return self._map(lambda x: x.to(device))
+
     def _map(self, function: Callable[[Tensor], Tensor]) -> State:
         return State(
             qpos=function(self.qpos),
@@ -116,6 +132,12 @@ class State:
             time=function(self.time),
             variables={name: function(x) for name, x in self.variables.items()},
         )
+
+
+def _given(name: str, value: Tensor | None) -> Tensor:
+    if value is None:
+        raise ValueError(f"expected a state with {name}, which this task reads, got None; take env.state")
+    return value
 
 
 def _rows(name: str, value: Tensor, ndim: int, n: int | None = None, last: int | None = None) -> int:

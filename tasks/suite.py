@@ -76,6 +76,7 @@ class SuiteTask(control.Task):
             seed = None if random is None else checks.whole("random", random, 0, 2**32 - 1)
             random = np.random.RandomState(seed)
         self.description = checks.instance("description", description, Task, "tasks.base.create makes one")
+        description.check_observation(description.sample_initial_state(1, torch.Generator()))
         self._generator = Generator().manual_seed(int(random.randint(2**31)))
         self._state: State | None = None
         self._fresh = True

@@ -18,9 +18,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from tasks.base import Edit, Entry, Task, check_timestep, register
-from tasks.curriculum import Averages, levels, next_level
-from tasks.draws import Range, check_range, draws, uniform
+from tasks.base import Edit, Task, check_timestep, register
+from tasks.constants import Constant
+from tasks.curriculum import Curriculum
+from tasks.draws import Range, check_range, draws, put, uniform
+from tasks.observation import Entry
 from tasks.rotations import matrix_of
 from tasks.state import State
 from torchrl_sym import PointGroup, Representation, checks
@@ -32,9 +34,6 @@ JOINTS = tuple(f"{joint}{finger}" for finger in FINGERS for joint in ("swing", "
 START_NOISE = 0.1
 # What observations are multiplied by: a fingertip's m and rad/s are far from 1.
 JOINT_VELOCITY_SCALE, POSITION_SCALE = 0.1, 10.0
-OBSERVATION_LIMIT = 20.0
-CUBE = 0.0325  # half its edge, m
-CUBE_DIAGONAL = math.sqrt(3) * CUBE
 ARENA = 0.1387  # the cube's centre starts, and has its goal, within this distance of the middle, m
 # Share of that radius which starts and goals are drawn from at the first level; it grows to 1 at the last.
 FIRST_SHARE, LAST_LEVEL = 0.4, 7
@@ -49,8 +48,6 @@ OUTSIDE = 0.30
 KERNEL = 30.0
 # Weights, per step. The first two are a hundredth of IsaacGymEnvs', the price of speed a thousandth.
 WEIGHTS = {"keypoints": 0.4, "approach": 2.5, "speed": -5e-4, "torque": -5e-4, "action_rate": -5e-4}
-# Kinematics of a finger, m: offset of the tip from the swing axis, lift axis along it, links, height.
-_SIDE, _AXIS, _LINK, _HEIGHT = 0.086, 0.0505, 0.16, 0.29
 
 
 @register
@@ -91,11 +88,10 @@ class TrifingerRepose(Task):
     name = "trifinger_repose"
     asset = "trifinger_repose.xml"
     control_timestep = 0.02
-    observation_size = 41
-    action_size = 9
     goal_names = ("right", "back left", "front left")
     task_terms = ("keypoints",)
     carried = ("cube", "goal")
+    observation_limit = 20.0
     max_velocity = 200.0
 
     def __init__(
@@ -121,36 +117,71 @@ class TrifingerRepose(Task):
         self.radius = checks.real("radius", radius, above=0.0, high=ARENA)
         if weak_finger is not None:
             weak_finger = checks.whole("weak_finger", weak_finger, 0, 2)
-        self.curriculum = checks.flag("curriculum", curriculum)
         self.cube_mass = check_range("cube_mass", cube_mass, above=0.0)
         self.friction = check_range("friction", friction, above=0.0)
         self.oriented = difficulty == 4 or yaw is not None
+        figures = ("success", "error", "level", *["angle"] * self.oriented)
+        self.curriculum = Curriculum(LAST_LEVEL, *figures, rising=curriculum)
         self.episode_seconds = 5.0 if difficulty == 1 else 15.0
         edit = _edit(check_timestep(physics_timestep), weak_finger)
         super().__init__(PointGroup.rotation(3), episode_seconds=episode_seconds, edit=edit)
-        self._start_pose = torch.from_numpy(self.model.qpos0[:9].copy())
+        self._start_pose = Constant(self.model.qpos0[:9])
         self._torque = float(self.model.actuator_ctrlrange[0, 1])  # the same for all
         turns = -torch.arange(3, dtype=torch.float64) * (2 * math.pi / 3)
-        self._turn = torch.stack([turns.cos(), turns.sin()])
-        signs = torch.tensor([-CUBE, CUBE], dtype=torch.float64)
-        self._corners = torch.cartesian_prod(signs, signs, signs)
-        self.averages = Averages("success", "error", "level", *["angle"] * self.oriented)
+        self._turn = Constant(torch.stack([turns.cos(), turns.sin()]))
+        self._read_finger()
+        self.cube = float(self.model.geom("cube").size[0])  # half its edge, m
+        signs = torch.tensor([-self.cube, self.cube], dtype=torch.float64)
+        self._corners = Constant(torch.cartesian_prod(signs, signs, signs))
+
+        cube = self.model.body("cube")
+        self._inertia = Constant(cube.inertia / cube.mass)  # per mass
+
+    def _read_finger(self) -> None:
+        """Kinematics, m: offset of the tip from the swing axis, lift axis along it, links, height."""
+        upper, middle, lower = (self.model.body(f"{part}0").pos for part in ("upper", "middle", "lower"))
+        tip = self.model.site("tip0").pos
+        # a sum of lengths given in hundredths of a millimetre, without the rounding of sums
+        self._side = round(float(middle[0] + lower[0] + tip[0]), 9)
+        self._axis, self._link, self._height = float(middle[1]), -float(lower[2]), float(upper[2])
 
     def layout(self) -> tuple[Entry, ...]:
         """Joints, cube, goal, last action."""
         group, robot = self.robot.group, self.robot
         joints, position, orientation = robot.joints(JOINTS), polar(group), quaternion(group)
         by_finger, lift = "permutation of the fingers", "quaternion, multiplied from the left"
-        speed = JOINT_VELOCITY_SCALE
+
+        def goal_orientation(state: State) -> Tensor:
+            goal = state.mocap_turn(0)
+            return goal if self.oriented else torch.zeros_like(goal)
+
         return (
-            Entry("joint positions from the starting pose", joints, "rad", "joints", by_finger),
-            Entry("joint velocities", joints, "rad/s", "joints", by_finger, speed),
-            Entry("cube position", position, "m", "world", "polar vector", POSITION_SCALE),
-            Entry("cube orientation", orientation, "1", "world", lift),
-            Entry("goal position", position, "m", "world", "polar vector", POSITION_SCALE),
-            Entry("goal orientation, zeros if it has none", orientation, "1", "world", lift),
-            Entry("last action", robot.actuators, "0.36 N m", "joints", by_finger),
-        )
+            Entry(
+                "joint positions from the starting pose",
+                lambda state: state.qpos[:, :9] - self._start_pose.like(state.qpos),
+                joints, "rad", "joints", by_finger,
+            ),
+            Entry(
+                "joint velocities", lambda state: state.qvel[:, :9],
+                joints, "rad/s", "joints", by_finger, JOINT_VELOCITY_SCALE,
+            ),
+            Entry(
+                "cube position", lambda state: state.qpos[:, 9:12],
+                position, "m", "world", "polar vector", POSITION_SCALE,
+            ),
+            Entry("cube orientation", lambda state: state.qpos[:, 12:16], orientation, "1", "world", lift),
+            Entry(
+                "goal position", lambda state: state.mocap_place(0),
+                position, "m", "world", "polar vector", POSITION_SCALE,
+            ),
+            Entry(
+                "goal orientation, zeros if it has none", goal_orientation, orientation, "1", "world", lift
+            ),
+            Entry(
+                "last action", lambda state: state.variables["last_action"],
+                robot.actuators, "0.36 N m", "joints", by_finger,
+            ),
+        )  # fmt: skip
 
     def variables(self) -> dict[str, Representation]:
         """Last action, distance of each fingertip from the cube one step ago, m, curriculum level."""
@@ -160,44 +191,46 @@ class TrifingerRepose(Task):
 
     def sample_goal_state(self, n: int, generator: torch.Generator | None) -> State:
         """The goal is on the right, give or take 60 degrees; at difficulty 2 the cube is."""
-        return self._start(levels(n, LAST_LEVEL), generator)
+        return self._start(self.curriculum.hardest(n, generator), generator)
 
     def sample_initial_state(self, n: int, generator: torch.Generator | None) -> State:
         """All goals; the first level, or with ``curriculum=False`` the last."""
-        level = levels(n, 0 if self.curriculum else LAST_LEVEL)
-        return self.mapped_at_random(self._start(level, generator), generator)
+        return self.mapped_at_random(self._start(self.curriculum.start(n, generator), generator), generator)
 
-    def restart(self, finished: State, generator: torch.Generator | None) -> State:
+    def restart(
+        self, finished: State, generator: torch.Generator | None, rows: Tensor | None = None
+    ) -> State:
         """Judge whole episodes: the next one reaches farther out after success, less far after failure."""
-        level = finished.variables["level"][:, 0]
-        whole = finished.time > self.episode_seconds - self.control_timestep / 2
-        whole |= self.terminated(finished)
-        success, error = whole & self.success(finished), self.position_error(finished)
-        ended = {"success": success, "error": error, "level": level}
-        far = error > FAILURE_DISTANCE
+        over = finished.time > self.episode_seconds - self.control_timestep / 2
+        figures = {"error": self.position_error(finished)}
+        far = figures["error"] > FAILURE_DISTANCE
         if self.oriented:
-            ended["angle"] = self.orientation_error(finished)
-            far |= ended["angle"] > FAILURE_ANGLE
-        self.averages.update(**{name: figure[whole] for name, figure in ended.items()})
-        if not self.curriculum:
-            return self.sample_initial_state(len(finished), generator)
-        failure = whole & ~success & far
-        level = next_level(level, success, failure, LAST_LEVEL, generator)
+            figures["angle"] = self.orientation_error(finished)
+            far |= figures["angle"] > FAILURE_ANGLE
+        level = self.curriculum.judge(
+            finished.variables["level"][:, 0],
+            whole=over | self.terminated(finished),
+            success=self.success(finished),
+            failed=far,
+            generator=generator,
+            rows=rows,
+            **figures,
+        )
         return self.mapped_at_random(self._start(level, generator), generator)
 
     def _start(self, level: Tensor, generator: torch.Generator | None) -> State:
         n = len(level)
         radius = self.radius * (FIRST_SHARE + (1 - FIRST_SHARE) * level / LAST_LEVEL)
         u = draws(n, 17, generator)
-        qpos = torch.zeros(n, self.model.nq, dtype=torch.float64)
-        qpos[:, :9] = self._start_pose + (2 * u[:, :9] - 1) * START_NOISE
+        qpos = u.new_zeros(n, self.model.nq)
+        qpos[:, :9] = self._start_pose.like(qpos) + (2 * u[:, :9] - 1) * START_NOISE
         anywhere, right = (2 * u[:, 9] - 1) * math.pi, (2 * u[:, 10] - 1) * (math.pi / 3)
         qpos[:, 9:11] = _place(radius, right if self.difficulty == 2 else anywhere, u[:, 11])
-        qpos[:, 11] = CUBE + 0.001  # exactly touching, rounding would decide which corners touch
+        qpos[:, 11] = self.cube + 0.001  # exactly touching, rounding would decide which corners touch
         half = u[:, 12] * (2 * math.pi)  # half the yaw: over a whole turn, both signs of the quaternion
         qpos[:, 12], qpos[:, 15] = half.cos(), half.sin()
-        goal = torch.zeros(n, 1, 3, dtype=torch.float64)
-        goal[:, 0, 2] = self._height(u[:, 14])
+        goal = u.new_zeros(n, 1, 3)
+        goal[:, 0, 2] = self._goal_height(u[:, 14])
         if self.difficulty != 2:
             goal[:, 0, :2] = _place(radius, right, u[:, 13])
         orientation = qpos[:, 12:16].clone()  # shown where the goal has none
@@ -205,25 +238,25 @@ class TrifingerRepose(Task):
             half = half + (2 * u[:, 15] - 1) * (self.yaw / 2) * (1 + level) / (1 + LAST_LEVEL)
             orientation[:, 0], orientation[:, 3] = half.cos(), half.sin()
         if self.difficulty == 4:
-            drawn = torch.randn(n, 4, generator=generator, dtype=torch.float64)
+            drawn = torch.randn(n, 4, generator=generator, dtype=u.dtype, device=u.device)
             orientation = drawn / drawn.norm(dim=-1, keepdim=True)
         state = State(
             qpos=qpos,
-            qvel=torch.zeros(n, self.model.nv, dtype=torch.float64),
+            qvel=u.new_zeros(n, self.model.nv),
             mocap_pos=goal,
             mocap_quat=orientation[:, None],
             variables={
-                "last_action": torch.zeros(n, 9, dtype=torch.float64),
+                "last_action": u.new_zeros(n, 9),
                 "level": level[:, None].clone(),
             },
         )
         state.variables["tip_distance"] = self.tip_distance(state)
         return state
 
-    def _height(self, u: Tensor) -> Tensor:
+    def _goal_height(self, u: Tensor) -> Tensor:
         if self.difficulty <= 2:
-            return torch.full_like(u, CUBE if self.difficulty == 1 else LIFT)
-        lowest = CUBE if self.difficulty == 3 else CUBE_DIAGONAL
+            return torch.full_like(u, self.cube if self.difficulty == 1 else LIFT)
+        lowest = self.cube if self.difficulty == 3 else math.sqrt(3) * self.cube
         return lowest + (HIGHEST - lowest) * u
 
     def randomize(self, simulation, ids: Tensor, generator: torch.Generator | None) -> None:
@@ -233,9 +266,8 @@ class TrifingerRepose(Task):
         if self.cube_mass is not None:
             mass = uniform(self.cube_mass, len(ids), generator)
             cube = self.model.body("cube").id
-            inertia = torch.from_numpy(self.model.body_inertia[cube] / self.model.body_mass[cube])
-            simulation.expand("body_mass")[ids, cube] = mass
-            simulation.expand("body_inertia")[ids, cube] = mass[:, None] * inertia
+            put(simulation.expand("body_mass")[:, cube], ids, mass)
+            put(simulation.expand("body_inertia")[:, cube], ids, mass[:, None] * self._inertia.like(mass))
             simulation.refresh(ids)
 
     def control(self, action: Tensor, state: State) -> Tensor:
@@ -246,20 +278,6 @@ class TrifingerRepose(Task):
         """Remember the action and the distances of the fingertips."""
         return {"last_action": action.double().clamp(-1.0, 1.0), "tip_distance": self.tip_distance(state)}
 
-    def observe(self, state: State) -> Tensor:
-        """Joints, cube, goal, last action."""
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        observation = torch.zeros(len(state), 41)
-        observation[:, 0:9] = state.qpos[:, :9] - self._start_pose
-        observation[:, 9:18] = state.qvel[:, :9] * JOINT_VELOCITY_SCALE
-        observation[:, 18:21] = state.qpos[:, 9:12] * POSITION_SCALE
-        observation[:, 21:25] = state.qpos[:, 12:16]
-        observation[:, 25:28] = state.mocap_pos[:, 0] * POSITION_SCALE
-        if self.oriented:
-            observation[:, 28:32] = state.mocap_quat[:, 0]
-        observation[:, 32:41] = state.variables["last_action"]
-        return observation.clamp_(-OBSERVATION_LIMIT, OBSERVATION_LIMIT)
-
     def fingertips(self, state: State) -> tuple[Tensor, Tensor]:
         """Centres of the fingertips, ``(n, 3, 3)``, m, and squares of their speeds, ``(n, 3)``, m^2/s^2.
 
@@ -269,16 +287,16 @@ class TrifingerRepose(Task):
         w0, w1, w2 = state.qvel[:, :9].unflatten(-1, (3, 3)).unbind(-1)
         q12, w12 = q1 + q2, w1 + w2
         sin1, cos1, sin12, cos12 = q1.sin(), q1.cos(), q12.sin(), q12.cos()
-        along = _AXIS + _LINK * (sin1 + sin12)  # the swing axis
-        down = -_LINK * (cos1 + cos12)
+        along = self._axis + self._link * (sin1 + sin12)  # the swing axis
+        down = -self._link * (cos1 + cos12)
         sin0, cos0 = q0.sin(), q0.cos()
-        across, height = _SIDE * cos0 + down * sin0, _HEIGHT - _SIDE * sin0 + down * cos0
-        cos, sin = self._turn
+        across, height = self._side * cos0 + down * sin0, self._height - self._side * sin0 + down * cos0
+        cos, sin = self._turn.like(q0)
         tips = torch.stack([across * cos - along * sin, across * sin + along * cos, height], dim=-1)
-        speed_along = _LINK * (cos1 * w1 + cos12 * w12)
-        speed_down = _LINK * (sin1 * w1 + sin12 * w12)
+        speed_along = self._link * (cos1 * w1 + cos12 * w12)
+        speed_down = self._link * (sin1 * w1 + sin12 * w12)
         # In the plane that swings: the tip turns about the axis and moves down.
-        square = speed_along.square() + (down * w0).square() + (speed_down - _SIDE * w0).square()
+        square = speed_along.square() + (down * w0).square() + (speed_down - self._side * w0).square()
         return tips, square
 
     def tip_distance(self, state: State) -> Tensor:
@@ -291,24 +309,21 @@ class TrifingerRepose(Task):
 
     def position_error(self, state: State) -> Tensor:
         """Distance of the cube from its goal, ``(n,)``, m."""
-        assert state.mocap_pos is not None
-        goal = state.mocap_pos[:, 0]
+        goal = state.mocap_place(0)
         return state.shared("position_error", lambda: (state.qpos[:, 9:12] - goal).norm(dim=-1))
 
     def orientation_error(self, state: State) -> Tensor:
         """Angle between cube and goal, ``(n,)``, rad; the same for both signs of a quaternion."""
-        assert state.mocap_quat is not None
-        product = (state.qpos[:, 12:16] * state.mocap_quat[:, 0]).sum(dim=-1).abs()
+        product = (state.qpos[:, 12:16] * state.mocap_turn(0)).sum(dim=-1).abs()
         return 2 * product.clamp(max=1.0).acos()
 
     def _keypoint_distance(self, state: State) -> Tensor:
         """Distance of the cube's corners from the goal's, ``(n, 8)``, m; or of the centres, ``(n, 1)``."""
         if not self.oriented:  # then all corners are off by the same
             return self.position_error(state)[:, None]
-        assert state.mocap_pos is not None and state.mocap_quat is not None
-        turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_quat[:, 0])
-        offset = state.qpos[:, 9:12] - state.mocap_pos[:, 0]
-        return (self._corners @ turn.mT + offset[:, None]).norm(dim=-1)
+        turn = matrix_of(state.qpos[:, 12:16]) - matrix_of(state.mocap_turn(0))
+        offset = state.qpos[:, 9:12] - state.mocap_place(0)
+        return (self._corners.like(turn) @ turn.mT + offset[:, None]).norm(dim=-1)
 
     def reward_terms(self, state: State, action: Tensor) -> dict[str, Tensor]:
         """Bring the corners to their goals, the fingertips to the cube, gently."""
@@ -337,15 +352,15 @@ class TrifingerRepose(Task):
 
     def metrics(self) -> dict[str, float]:
         """Success rate, final errors (m, rad) and level, means of about the last 500 episodes."""
-        return dict(self.averages.values)
+        return self.curriculum.averages.numbers()
 
     def state_dict(self) -> dict[str, Any]:
         """The averages that :meth:`metrics` reports."""
-        return dict(self.averages.values)
+        return self.curriculum.averages.numbers()
 
     def load_state_dict(self, saved: dict[str, Any]) -> None:
         """Continue from :meth:`state_dict`."""
-        self.averages.load(saved)
+        self.curriculum.averages.load(saved)
 
 
 def _place(radius: Tensor, bearing: Tensor, u: Tensor) -> Tensor:

@@ -1,13 +1,18 @@
 """ANYmal in numbers: kinematics and contact against MuJoCo, gait terms by hand, edits of the model."""
 
+import inspect
+from typing import get_type_hints
+
 import mujoco
 import pytest
 import torch
 from tensordict import TensorDict
+from typing_extensions import Unpack
 
 import tasks
 from tasks import base
-from tasks.anymal import FOOT_RADIUS, JOINTS, LEGS
+from tasks.anymal import JOINTS, LEGS, Anymal, RobotArguments
+from tasks.anymal_climb import AnymalClimb
 from tasks.anymal_push import AnymalPush
 from tasks.environment import BatchedEnv
 from tests.task_helpers import actions, assert_same, make, play, reached, stagger
@@ -74,7 +79,7 @@ def test_the_robot_is_observed_as_mujoco_measures_it(name):
                 2 * turn.T @ velocity[:3],
                 0.25 * velocity[3:],
                 -turn.T[:, 2],
-                state.qpos[row, 7:19] - task._pose,
+                state.qpos[row, 7:19] - task._pose.values,
             ]
         )
         torch.testing.assert_close(observation[row, :21], expected, rtol=1e-6, atol=1e-6)
@@ -88,9 +93,9 @@ def test_the_robot_is_observed_as_mujoco_measures_it(name):
 def test_a_start_stands_with_its_lowest_foot_5_mm_above_the_ground(name):
     task = base.create(name)
     state = task.sample_initial_state(200, torch.Generator().manual_seed(0))
-    lowest = task.feet(state)[..., 2].amin(dim=1) - FOOT_RADIUS
+    lowest = task.feet(state)[..., 2].amin(dim=1) - task.foot_radius
     torch.testing.assert_close(lowest, torch.full_like(lowest, 0.005), rtol=0, atol=1e-12)
-    assert ((state.qpos[:, 7:19] - task._pose).abs() <= 0.1).all()
+    assert ((state.qpos[:, 7:19] - task._pose.values).abs() <= 0.1).all()
     stood = reached(task, state.rows(slice(40)), steps=50)
     assert len(stood) == 40, "a robot that is left alone must not fall"
     assert task.touching(stood).all()
@@ -100,7 +105,7 @@ def test_feet_touch_the_ground_where_mujoco_finds_contact():
     task = AnymalPush()
     start = task.sample_goal_state(24, torch.Generator().manual_seed(0))
     state = reached(task, start, steps=25, scale=0.5)
-    gap = task.feet(state)[..., 2] - FOOT_RADIUS
+    gap = task.feet(state)[..., 2] - task.foot_radius
     assert torch.equal(task.touching(state), gap < 0.01)
     agreed = 0
     for row in range(len(state)):
@@ -116,8 +121,8 @@ def test_feet_touch_the_ground_where_mujoco_finds_contact():
 def test_time_in_the_air_is_counted_per_foot_and_paid_once_on_landing():
     task = AnymalPush()
     state = task.sample_goal_state(6, torch.Generator().manual_seed(0))
-    state.qpos[:, 7:19] = task._pose
-    state.qpos[:, 2] = FOOT_RADIUS - task.feet_in_base(state.qpos[:, 7:19])[..., 2].amin(dim=1)
+    state.qpos[:, 7:19] = task._pose.values
+    state.qpos[:, 2] = task.foot_radius - task.feet_in_base(state.qpos[:, 7:19])[..., 2].amin(dim=1)
     lifted = torch.tensor([0, 0, 0, 0, 1, 1], dtype=torch.bool)
     state.qpos[lifted, 8] += 0.8
     state.qpos[lifted, 9] -= 0.6
@@ -143,10 +148,25 @@ def test_steps_never_cost_and_pay_at_most_30_ms_a_foot(name):
     assert (paid >= 0).all() and (paid <= 4 * 0.3 + 1e-12).all() and paid.max() > 1
 
 
+def test_constants_are_those_of_the_published_robot():
+    task = AnymalPush()
+    assert (task.foot_radius, task.cube) == (0.03, 0.3)
+    assert (task._stiffness, task._damping, task._torque) == (80.0, 2.0, 80.0)
+    weak = AnymalPush(weak_leg="LF")  # the reward is that of the robot that designers have in mind
+    assert weak._torque == 80.0
+    left = [
+        [0.2999, 0.104, 0.0],
+        [0.0599, 0.08381, 0.0],
+        [0.0, 0.1003, -0.285],
+        [0.08795, 0.01305, -0.31547],
+    ]
+    assert task._legs.values[..., 0].tolist() == left
+
+
 def test_effort_by_hand():
     task = AnymalPush()
     state = task.sample_goal_state(1, torch.Generator().manual_seed(0))
-    state.qpos[:, 7:19] = task._pose
+    state.qpos[:, 7:19] = task._pose.values
     state.qvel[:, 6] = 3.0
     state.variables["last_velocity"][:, 0] = 1.0
     action = torch.zeros(1, 12)
@@ -333,10 +353,20 @@ def test_unknown_arguments_list_inherited_ones_too(name, function):
         function(name, gravity=3.0)
 
 
+def test_signatures_of_the_robots_tasks_say_what_the_robot_takes():
+    """Type checkers read the one, the interpreter the other."""
+    robot = inspect.signature(Anymal.__init__, eval_str=True).parameters
+    declared = get_type_hints(RobotArguments)
+    assert declared == {name: p.annotation for name, p in robot.items() if name != "self"}
+    for task in (AnymalPush, AnymalClimb):
+        hints = get_type_hints(task.__init__, include_extras=True)
+        assert hints["robot"] == Unpack[RobotArguments]
+
+
 def test_targets_of_the_joints_are_clipped():
     env = make("anymal_push", num_envs=2)
     state = env.task.sample_goal_state(2, torch.Generator().manual_seed(0))
     env.reset_to(state)
     env.step(TensorDict(action=torch.full((2, 12), 9.0), batch_size=[2]))
-    torch.testing.assert_close(env.simulation.ctrl, (env.task._pose + 2.0).expand(2, 12))
+    torch.testing.assert_close(env.simulation.ctrl, (env.task._pose.values + 2.0).expand(2, 12))
     assert (env.state.variables["last_action"] == 1).all()

@@ -12,7 +12,6 @@ from tensordict import TensorDict
 from tasks.anymal import rotation
 from tasks.anymal_climb import (
     BIAS_WEIGHTS,
-    BOX,
     COLUMNS,
     FALL_PENALTY,
     HEIGHT_SCALE,
@@ -24,6 +23,8 @@ from tasks.anymal_climb import (
 from tasks.environment import BatchedEnv
 from tests.task_helpers import make, reached, starting_at
 from torchrl_sym.mujoco import verify
+
+BOX = 1.0  # half its edge, m
 
 
 def around_the_box(task, n, seed=0):

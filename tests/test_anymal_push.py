@@ -10,7 +10,6 @@ import torch
 from tasks.anymal import into_base, rotation
 from tasks.anymal_push import (
     BASE_HEIGHT,
-    CUBE,
     FALL_PENALTY,
     GAIT_WEIGHTS,
     SPEED,
@@ -25,6 +24,8 @@ from tasks.environment import BatchedEnv
 from tasks.state import concatenate
 from tests.task_helpers import reached, starting_at
 from torchrl_sym.mujoco import verify
+
+CUBE = 0.3  # half its edge, m
 
 
 def standing(n=1, seed=0, task=None):

@@ -6,14 +6,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tasks.anymal_climb import BOX, AnymalClimb
 from tasks.anymal_climb import LAST_LEVEL as LAST_BOX
+from tasks.anymal_climb import AnymalClimb
 from tasks.anymal_push import LAST_LEVEL as LAST_TARGET
 from tasks.anymal_push import AnymalPush
-from tasks.curriculum import EPISODE_WEIGHT, Averages, next_level
+from tasks.curriculum import EPISODE_WEIGHT, Averages, Curriculum, next_level
 from tasks.environment import BatchedEnv
 from tasks.trifinger_repose import TrifingerRepose
 from tests.task_helpers import actions, assert_same, make, play
+
+BOX = 1.0  # half the edge of the box to climb, m
 
 
 def generator(seed=0):
@@ -59,12 +61,53 @@ def test_averages_start_with_the_first_episodes_and_remember_about_500():
 
 def test_averages_of_another_version_of_a_task_are_kept_where_this_one_has_them():
     plain, oriented = TrifingerRepose(), TrifingerRepose(yaw=math.pi)
-    plain.averages.update(success=torch.ones(1), error=torch.ones(1), level=torch.ones(1))
+    plain.curriculum.averages.update(success=torch.ones(1), error=torch.ones(1), level=torch.ones(1))
     oriented.load_state_dict(plain.state_dict())
     assert oriented.metrics()["success"] == 1.0 and math.isnan(oriented.metrics()["angle"])
-    oriented.averages.update(angle=torch.ones(1))
+    oriented.curriculum.averages.update(angle=torch.ones(1))
     plain.load_state_dict(oriented.state_dict())
     assert plain.metrics() == {"success": 1.0, "error": 1.0, "level": 1.0}
+
+
+def test_a_curriculum_judges_whole_episodes_and_success_before_failure():
+    curriculum = Curriculum(7, "success", "level", "distance")
+    assert curriculum.start(2).tolist() == [0.0, 0.0] and curriculum.hardest(1).tolist() == [7.0]
+    level = curriculum.judge(
+        torch.full((5,), 3.0),
+        whole=flags("xxxx."),
+        success=flags("x.x.x"),
+        failed=flags("..xxx"),
+        generator=None,
+        distance=torch.tensor([1.0, 2.0, 3.0, 4.0, 9.0]),
+    )
+    assert level.tolist() == [4.0, 3.0, 4.0, 2.0, 3.0]
+    assert curriculum.averages.values == {"success": 0.5, "level": 3.0, "distance": 2.5}
+
+
+def test_a_curriculum_that_does_not_rise_stays_at_the_last_level_and_draws_nothing():
+    curriculum, random = Curriculum(7, "success", "level", rising=False), generator()
+    before = random.get_state()
+    level = torch.tensor([7.0, 7.0])
+    after = curriculum.judge(
+        level, whole=flags("xx"), success=flags("x."), failed=flags(".x"), generator=random
+    )
+    assert curriculum.start(2).tolist() == after.tolist() == [7.0, 7.0]
+    assert curriculum.averages.values == {"success": 0.5, "level": 7.0}
+    assert torch.equal(random.get_state(), before)
+
+
+@pytest.mark.parametrize(
+    ("task", "saved"),
+    [
+        (AnymalPush, {"averages": {"success": 0.5, "level": 2.0}}),
+        (AnymalClimb, {"phase": "B", "averages": {"success": 0.5, "level": 2.0, "distance": 0.3}}),
+        (TrifingerRepose, {"success": 0.5, "error": 0.02, "level": 2.0}),
+    ],
+)
+def test_states_are_stored_in_the_form_of_older_checkpoints(task, saved):
+    restored = task()
+    restored.load_state_dict(saved)
+    assert restored.state_dict() == saved and restored.metrics()["success"] == 0.5
 
 
 def finished_pushes(task):
@@ -184,7 +227,7 @@ def test_the_phase_of_a_checkpoint_counts_in_a_curriculum_alone():
 @pytest.mark.parametrize("phase", ["A", "C"])
 def test_without_a_curriculum_every_box_has_full_height_and_the_phase_stays(phase):
     task = AnymalClimb(height=0.3, phase=phase, curriculum=False)
-    task.averages.values = {"success": 1.0, "level": 8.0, "distance": 0.1}
+    task.curriculum.averages.values = {"success": 1.0, "level": 8.0, "distance": 0.1}
     for state in (
         task.sample_initial_state(50, generator()),
         task.restart(finished_climbs(task), generator()),
@@ -198,7 +241,7 @@ def test_phases_follow_each_other_as_climbing_succeeds():
     task = AnymalClimb()
 
     def after(success, level):
-        task.averages.values |= {"success": success, "level": level}
+        task.curriculum.averages.values |= {"success": success, "level": level}
         unstarted = task.sample_initial_state(4, generator())
         return task.restart(unstarted, generator()), task.phase
 
@@ -237,14 +280,14 @@ def test_only_phase_a_rewards_walking_towards_the_target():
 @pytest.mark.parametrize("task_class", [AnymalPush, AnymalClimb])
 def test_what_a_task_learned_survives_its_state_dict(task_class):
     task, other = task_class(), task_class()
-    task.averages.values |= {"success": 0.25, "level": 2.5}
+    task.curriculum.averages.values |= {"success": 0.25, "level": 2.5}
     if task_class is AnymalClimb:
-        task.phase = "B"
+        task._phase = 1
     other.load_state_dict(task.state_dict())
     assert other.metrics().keys() == task.metrics().keys()
     assert other.metrics()["success"] == 0.25
     assert getattr(other, "phase", "A") == getattr(task, "phase", "A")
-    task.averages.values["success"] = 0.75
+    task.curriculum.averages.values["success"] = 0.75
     assert other.metrics()["success"] == 0.25, "must not share memory"
 
 
@@ -255,7 +298,7 @@ def test_levels_phase_and_averages_continue_exactly(name):
         start = env.task.sample_initial_state(4, generator())
         start.variables["level"][:, 0] = torch.tensor([7.0, 5.0, 2.0, 0.0])
         if name == "anymal_climb":  # at the first reset phase B begins
-            env.task.averages.values |= {"success": 0.9, "level": 6.0}
+            env.task.curriculum.averages.values |= {"success": 0.9, "level": 6.0}
         return env, env.reset_to(start)
 
     first, td = env(0)

@@ -6,7 +6,6 @@ import math
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -231,26 +230,6 @@ def test_values_of_next_states_take_one_pass():
         torch.testing.assert_close(data[key], expected[key].detach())
     passed = sum(x.shape[:-1].numel() for x in rows)
     assert passed == data.numel() + len(data) + 2  # two episodes ended before the last step
-
-
-@pytest.mark.parametrize("adapt_every", ["minibatch", "iteration"])
-def test_the_host_waits_for_no_minibatch_of_an_accelerator(adapt_every, monkeypatch):
-    """A tensor on the meta device has no value that could be asked for: what asks raises."""
-    learner, _ = make_learner(dataclasses.replace(TINY, adapt_every=adapt_every))
-    monkeypatch.setattr(learner.optimizer, "step", lambda: None)
-    weight = torch.nn.Parameter(torch.ones(3, device="meta"))
-    number = torch.ones((), device="meta")
-    learner.parameters = [weight]
-    learner.evaluate = lambda _: {
-        "loss_objective": weight.sum(),
-        "mean_ratio": number,
-        "kl_approx": number,
-    }
-    report = learner._update(TensorDict())
-    with pytest.raises(RuntimeError, match="meta"):
-        float(report["kl"])
-    rate = learner.optimizer.param_groups[0]["lr"]
-    assert isinstance(rate, torch.Tensor) == (adapt_every == "minibatch")
 
 
 @pytest.mark.parametrize("augmentation", ["none", "all"])

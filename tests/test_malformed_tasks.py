@@ -1,4 +1,4 @@
-"""Malformed arguments of tasks, states, curricula and pictures are refused."""
+"""Malformed arguments of tasks, states and pictures are refused."""
 
 import functools
 
@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 import tasks
-from tasks import base, curriculum, draws, paths, rendering, state, suite
+from tasks import base, draws, paths, rendering, state, suite
 from tests.malformed import (
     Argument,
     array,
@@ -23,7 +23,6 @@ from tests.malformed import (
     tensor,
     thing,
 )
-from torchrl_sym import representations as r
 
 CLIMB, PUSH, CARTPOLE, REPOSE = (base.create(name) for name in tasks.ALL_TASKS)
 START = CARTPOLE.sample_goal_state(2, None)
@@ -173,16 +172,6 @@ SUBJECTS = [
         above=Argument(0.0, {}),
     ),
     subject(
-        "Entry",
-        base.Entry,
-        name=choice("velocity").but("misspelt", "other case", "empty"),
-        representation=thing(r.polar(CARTPOLE.symmetry.group), builder=r.polar),
-        unit=Argument("m", {"None": None, "a number": 3}),
-        frame=Argument("base", {"None": None}),
-        kind=Argument("polar", {"None": None}),
-        scale=number(2.0, low=-np.inf),
-    ),
-    subject(
         "register",
         lambda cls: base._TASKS.pop(base.register(cls).name),
         cls=Argument(
@@ -243,77 +232,6 @@ SUBJECTS = [
                     state.State(START.qpos, START.qvel, torch.zeros(2, 1, 3), torch.zeros(2, 1, 4)),
                 ],
             }
-        ),
-    ),
-    subject(
-        "next_level",
-        curriculum.next_level,
-        level=tensor(torch.tensor([0.0, 1.0]), **of_three(3)),
-        success=tensor(torch.tensor([True, False]), **of_three(3)),
-        failure=tensor(torch.tensor([False, False]), **of_three(3)),
-        last=count(7),
-        generator=generator,
-    ),
-    subject(
-        "Averages",
-        lambda names: curriculum.Averages(*names),
-        names=Argument(
-            ["success", "level"],
-            {"twice": ["a", "a"], "numbers": [1, 2], "empty texts": [""], "nested": [["a"]]},
-        ),
-    ),
-    subject(
-        "update",
-        lambda values: curriculum.Averages("success").update(**values),
-        values=Argument(
-            {"success": torch.ones(2)},
-            {
-                "misspelt": {"sucess": torch.ones(2)},
-                "text": {"success": "1"},
-                "None": {"success": None},
-                "a number": {"success": 1.0},
-            },
-        ),
-    ),
-    subject(
-        "load averages",
-        curriculum.Averages("success").load,
-        values=Argument(
-            {"success": 0.5},
-            {
-                "None": None,
-                "a list": [0.5],
-                "text": {"success": "1"},
-                "flag": {"success": True},
-                "nothing": {"success": None},
-            },
-        ),
-    ),
-    subject(
-        "load_state_dict of climb",
-        CLIMB.load_state_dict,
-        saved=Argument(
-            CLIMB.state_dict(),
-            {
-                "None": None,
-                "empty": {},
-                "of another task": REPOSE.state_dict(),
-                "another phase": CLIMB.state_dict() | {"phase": "Z"},
-            },
-        ),
-    ),
-    subject(
-        "load_state_dict of push",
-        PUSH.load_state_dict,
-        saved=Argument(
-            PUSH.state_dict(), {"None": None, "empty": {}, "of another task": REPOSE.state_dict()}
-        ),
-    ),
-    subject(
-        "load_state_dict of repose",
-        REPOSE.load_state_dict,
-        saved=Argument(
-            REPOSE.state_dict(), {"None": None, "a list": [1], "of another task": PUSH.state_dict()}
         ),
     ),
     subject(

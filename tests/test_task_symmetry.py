@@ -92,7 +92,7 @@ def test_the_layout_describes_every_number_observed(name):
     for entry in task.layout():
         block = slice(start, start + entry.representation.dim)
         assert torch.equal(matrices[:, block, block], entry.representation.matrices), entry.name
-        assert entry.unit and entry.frame and entry.kind and entry.scale > 0
+        assert entry.unit and entry.frame and entry.kind and entry.scale > 0 < entry.divisor
         start = block.stop
     assert start == task.observation_size == matrices.shape[-1]
     blocks = [entry.representation.matrices.abs() for entry in task.layout()]

@@ -1,5 +1,6 @@
 """The batched environment of every registered task: TorchRL's contract, divergence, names."""
 
+import dataclasses
 import functools
 import pickle
 
@@ -13,6 +14,7 @@ import tasks
 from tasks import base
 from tasks.cartpole import CartPole
 from tasks.environment import BatchedEnv
+from tasks.suite import SuiteTask
 from tests.task_helpers import Falling, actions, all_tasks, assert_same, make, play, stagger
 
 
@@ -270,15 +272,24 @@ def test_a_task_that_contradicts_itself_is_refused():
         goal_names = ("a", "b", "c")
 
     class FourNumbers(CartPole):
-        observation_size = 4
+        def observe(self, state):
+            return super().observe(state)[:, [0, 1, 2, 2]]
+
+    class TwoAngles(CartPole):
+        def layout(self):
+            velocity, angle, rate = super().layout()
+            return velocity, dataclasses.replace(angle, value=lambda state: state.qpos), rate
 
     class OddTimestep(CartPole):
         control_timestep = 0.03
 
     with pytest.raises(ValueError, match=r"one goal name per group element.*\['a', 'b', 'c'\]"):
         BatchedEnv(ThreeGoals(), 2)
-    with pytest.raises(ValueError, match="observation"):
-        BatchedEnv(FourNumbers(), 2)
+    for face in (lambda task: BatchedEnv(task, 2), SuiteTask):
+        with pytest.raises(ValueError, match=r"observation: expected 3 numbers a row.*got shape \(1, 4"):
+            face(FourNumbers())
+        with pytest.raises(ValueError, match=r"'pole angle from upright' of shape \(1, 1\).*\(1, 2"):
+            face(TwoAngles())
     with pytest.raises(ValueError, match=r"multiple of the model's timestep 0.02 s, got 0.03"):
         OddTimestep()
 

@@ -12,8 +12,6 @@ from tasks.environment import BatchedEnv
 from tasks.state import State
 from tasks.trifinger_repose import (
     ARENA,
-    CUBE,
-    CUBE_DIAGONAL,
     HIGHEST,
     JOINTS,
     LIFT,
@@ -23,6 +21,9 @@ from tasks.trifinger_repose import (
 from torchrl_sym import PointGroup
 from torchrl_sym.mujoco import audit, verify
 from torchrl_sym.representations import axial, polar, quaternion
+
+CUBE = 0.0325  # half its edge, m
+CUBE_DIAGONAL = math.sqrt(3) * CUBE
 
 C3 = PointGroup.rotation(3)
 difficulties = pytest.mark.parametrize("difficulty", [1, 2, 3, 4])
@@ -51,6 +52,12 @@ def single(task, state, row=0):
 def test_the_model_is_exactly_symmetric():
     task = TrifingerRepose()
     assert audit(task.model, C3, carried=task.carried).exact
+
+
+def test_lengths_are_those_of_the_published_robot():
+    task = TrifingerRepose()
+    assert (task._side, task._axis, task._link, task._height) == (0.086, 0.0505, 0.16, 0.29)
+    assert task.cube == CUBE and task._torque == 0.36
 
 
 def test_a_weak_finger_is_not_symmetric():

@@ -1,4 +1,9 @@
-"""What a checkpoint holds, and how a run continues from it, exactly."""
+"""What a checkpoint holds, and how a run continues from it, exactly.
+
+All processes that share a training have the same networks, optimizer and running episodes, and an
+environment and random numbers of their own: those of the first are entries of the checkpoint, those of the
+others are in its list ``others``.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.environment import Resumable, describe, offered
 from torchrl_sym.recipes.metrics import Episodes
+from torchrl_sym.recipes.ranks import Ranks
 from torchrl_sym.recipes.storage import RunFolder
 
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+")
@@ -27,9 +33,16 @@ def snapshot(
     episodes: Episodes,
     iteration: int,
     seconds: float,
+    ranks: Ranks,
 ) -> dict[str, Any]:
     """Everything that decides the future of the run, as plain containers of tensors and numbers."""
     resumable = offered(env, Resumable)
+    own = {
+        **random_state(config.device),
+        "env": None if resumable is None else resumable.save_state(),
+        "transforms": env.transform.state_dict() if isinstance(env, TransformedEnv) else None,
+    }
+    first, *others = ranks.every(own)
     return {
         "config": dataclasses.asdict(config),
         "environment": _plain(describe(env)),
@@ -37,18 +50,48 @@ def snapshot(
         "seconds": seconds,
         "parts": {name: part.state_dict() for name, part in parts.items()},
         "episodes": episodes.state_dict(),
-        "rng": torch.get_rng_state(),
-        "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_available() else [],
-        "env": None if resumable is None else resumable.save_state(),
-        "transforms": env.transform.state_dict() if isinstance(env, TransformedEnv) else None,
+        **first,
+        **({"others": others} if others else {}),
     }
 
 
-def require_same_run(run: RunFolder, checkpoint: dict[str, Any], config: PPOConfig, env: EnvBase) -> None:
+def random_state(device: str) -> dict[str, Any]:
+    """State of torch's global generators, on the CPU and on a device."""
+    cuda = torch.device(device).type == "cuda"
+    return {"rng": torch.get_rng_state(), "cuda_rng": [torch.cuda.get_rng_state(device)] if cuda else []}
+
+
+def restore_random(state: dict[str, Any], device: str) -> None:
+    """Continue torch's global generators from a state that holds :func:`random_state`."""
+    torch.set_rng_state(state["rng"])
+    if torch.device(device).type == "cuda" and state["cuda_rng"]:
+        torch.cuda.set_rng_state(state["cuda_rng"][0], device)
+
+
+def require_same_ranks(run: RunFolder, checkpoint: dict[str, Any], ranks: Ranks) -> None:
+    """ValueError if another number of processes wrote it: each has environments of its own."""
+    count = 1 + len(checkpoint.get("others", []))
+    if count != ranks.count:
+        raise ValueError(
+            f"expected as many processes as the run in {run.path} has, {count}, each with environments of "
+            f"its own, got {ranks.count}; start it with torchrun --nproc-per-node={count}, or train anew "
+            "in another folder"
+        )
+
+
+def own_part(checkpoint: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
+    """A checkpoint with this process's environment and random numbers."""
+    return checkpoint | [{}, *checkpoint.get("others", [])][ranks.index]
+
+
+def require_same_run(
+    run: RunFolder, checkpoint: dict[str, Any], config: PPOConfig, env: EnvBase, ranks: Ranks
+) -> None:
     """A run may only be continued as what it was.
 
     Raises:
-        ValueError: the folder holds another configuration, another environment, or no run at all.
+        ValueError: the folder holds another configuration, another environment, a run of another number of
+            processes, or no run at all.
     """
     if "optimizer" not in checkpoint["parts"]:
         raise ValueError(
@@ -61,6 +104,7 @@ def require_same_run(run: RunFolder, checkpoint: dict[str, Any], config: PPOConf
             f"expected a checkpoint of recipes.train in {run.path}, got one without {sorted(missing)}; "
             "restore it from a copy, or delete the folder to train anew"
         )
+    require_same_ranks(run, checkpoint, ranks)
     stored, asked = checkpoint.get("environment"), _plain(describe(env))
     other = {} if stored is None else _differences(stored, asked)  # earlier versions did not store it
     if other:
@@ -101,13 +145,6 @@ def restore(
         episodes.load_state_dict(checkpoint["episodes"])
     else:  # new episodes begin, whose returns are theirs alone
         episodes.latest = checkpoint["episodes"]["latest"]
-
-
-def restore_random(checkpoint: dict[str, Any]) -> None:
-    """Continue torch's global generators."""
-    torch.set_rng_state(checkpoint["rng"])
-    if torch.cuda.is_available() and len(checkpoint["cuda_rng"]) == torch.cuda.device_count():
-        torch.cuda.set_rng_state_all(checkpoint["cuda_rng"])
 
 
 def warn_unless_exact(env: EnvBase) -> None:

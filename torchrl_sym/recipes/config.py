@@ -118,9 +118,10 @@ class PPOConfig:
     checkpoint_interval: int = 1
     """Iterations between checkpoints; the last one is always saved."""
     device: str = "cpu"
-    """Where networks and updates live; physics stays on the CPU."""
+    """Where networks and updates live; physics is where the environment has it."""
     compile: bool = False
-    """Compile the losses, where there is a compiler: about a minute before the first update."""
+    """Compile the losses, where there is a compiler: about a minute before the first update. On ``"cuda"``,
+    updates are also recorded into a CUDA graph, unless several processes share them."""
     autocast: Literal["bfloat16"] | None = None
     """Precision of the matrix products in the losses, None for that of the networks. Advantages, actions
     and the parameters keep theirs."""
@@ -154,6 +155,11 @@ class PPOConfig:
                 "max_log_ratio: expected at most 700, whose exponential is a number, or inf for no bound, "
                 f"got {self.max_log_ratio}"
             )
+
+    @property
+    def accelerated(self) -> bool:
+        """Whether the host would wait for every number that it asks the networks' device for."""
+        return torch.device(self.device).type != "cpu"
 
     def scheduled_std(self, iteration: int) -> float | None:
         """Standard deviation of an iteration, counted from 1; None if it is learned.

@@ -11,6 +11,7 @@ import numbers
 import warnings
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_sym.environments.inside import bare
@@ -50,8 +51,12 @@ class Resumable(Protocol):
 class Measured(Protocol):
     """Measures what a return does not show: success rate, level of a curriculum."""
 
-    def metrics(self) -> dict[str, float]:
-        """Figures since the last call, always under the same names."""
+    def metrics(self) -> dict[str, float | Tensor]:
+        """Figures since the last call, always under the same names.
+
+        Tensors of one element, on an accelerator, are fetched with everything else; a number would have
+        been waited for.
+        """
         ...
 
 
@@ -91,23 +96,27 @@ def seed_unless_own(env: EnvBase, seed: int) -> None:
         )
 
 
-def measure(env: EnvBase) -> dict[str, float]:
-    """What the environment measures.
+def measure(env: EnvBase) -> dict[str, float | Tensor]:
+    """What the environment measures, numbers or tensors of one element.
 
     Raises:
-        TypeError: a value that is not a number.
+        TypeError: a value that is neither.
     """
     source = offered(env, Measured)
     if source is None:
         return {}
     metrics = source.metrics()
     for name, value in metrics.items():
-        if not isinstance(value, numbers.Real):
+        single = isinstance(value, Tensor) and value.numel() == 1
+        if not single and not isinstance(value, numbers.Real):
             raise TypeError(
                 f"expected a number for each of metrics() of {type(source).__name__}, got {value!r} for "
                 f"{name!r}; convert it by float()"
             )
-    return {name: float(value) for name, value in metrics.items()}
+    return {
+        name: value if isinstance(value, Tensor) else float(value)  # pyright: ignore[reportArgumentType]
+        for name, value in metrics.items()
+    }
 
 
 def describe(env: EnvBase) -> dict[str, Any]:

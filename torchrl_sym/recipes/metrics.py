@@ -8,12 +8,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_sym.mirror_loss import mirror_error
 from torchrl_sym.outputs import deterministic_action
 from torchrl_sym.symmetry import Symmetry
 
+SYMMETRY_METRICS = ("mirror_loss", "log_prob", "log_prob_copies")
 _MAX_ROWS = 2048  # rows on which the symmetry metrics are evaluated
 
 
@@ -25,18 +27,21 @@ class Episodes:
     Args:
         env: the environment whose batches will be seen; its batch size is the number of episodes
             that run side by side.
+        processes: with an environment of its own each, whose batches come as one.
     """
 
-    def __init__(self, env: EnvBase) -> None:
-        self.running = torch.zeros(env.batch_size.numel())
+    def __init__(self, env: EnvBase, processes: int = 1) -> None:
+        self.running = torch.zeros(processes * env.batch_size.numel())
         self.whole = torch.zeros(len(self.running), dtype=torch.bool)  # past their first episode
         self.latest = math.nan
 
     def update(self, data: TensorDictBase) -> float:
         """Mean return of the episodes that ended in a batch ``[*env, T]``; if none did, the last mean."""
-        rewards, dones = (
-            data["next", key].cpu().reshape(len(self.running), -1) for key in ("reward", "done")
-        )
+        return self.add(data["next", "reward"].cpu(), data["next", "done"].cpu())
+
+    def add(self, reward: Tensor, done: Tensor) -> float:
+        """The same of rewards and ends ``[*env, T, 1]`` that are on the CPU."""
+        rewards, dones = (x.reshape(len(self.running), -1) for x in (reward, done))
         finished = []
         for reward, done in zip(rewards.unbind(1), dones.unbind(1), strict=True):
             self.running = self.running + reward
@@ -58,7 +63,6 @@ class Episodes:
         self.latest = state["latest"]
 
 
-@torch.no_grad()
 def symmetry_metrics(
     actor: ProbabilisticTensorDictSequential, symmetry: Symmetry, data: TensorDictBase
 ) -> dict[str, float]:
@@ -74,6 +78,15 @@ def symmetry_metrics(
         log pi_k(a | s); ``log_prob_copies``, the mean of log pi_k(K_g[a] | L_g[s]) over the copies, the
         denominator of naive augmentation (the paper's log-probability figure).
     """
+    means = symmetry_means(actor, symmetry, data)
+    return dict(zip(SYMMETRY_METRICS, means.tolist(), strict=True))
+
+
+@torch.no_grad()
+def symmetry_means(
+    actor: ProbabilisticTensorDictSequential, symmetry: Symmetry, data: TensorDictBase
+) -> Tensor:
+    """Values of :func:`symmetry_metrics` in the order of ``SYMMETRY_METRICS``, where the data are."""
     rows = data.select(*actor.in_keys, "action").reshape(-1)
     rows = rows[:: math.ceil(len(rows) / _MAX_ROWS)]
     orbit = symmetry.orbit(rows)
@@ -82,5 +95,4 @@ def symmetry_metrics(
     copies = log_prob[1:] if len(log_prob) > 1 else log_prob
     action = deterministic_action(dist)  # pi(L_g[s])
     error = mirror_error(action, action[0], symmetry["action"], range(len(action)))
-    means = torch.stack([error.sum(0).mean(), log_prob[0].mean(), copies.mean()])
-    return dict(zip(("mirror_loss", "log_prob", "log_prob_copies"), means.tolist(), strict=True))
+    return torch.stack([error.sum(0).mean(), log_prob[0].mean(), copies.mean()])

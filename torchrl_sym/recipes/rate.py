@@ -1,7 +1,7 @@
 """The learning rate that follows the policy's change, as rsl_rl adapts it.
 
 TorchRL's ``KLAdaptiveLR`` has the same rule in Python numbers: the host then waits for each minibatch of an
-accelerator before it can prepare the next. Here the rate stays where the networks are.
+accelerator before it can prepare the next. Here a rate that is a tensor is changed where it is.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ class AdaptiveRate:
     """Divides the learning rate by 1.5 above twice the desired KL, multiplies it by 1.5 below half of it.
 
     Args:
-        optimizer: whose rate it is; elsewhere than on the CPU, a tensor from the first step on.
+        optimizer: whose rate it is, a number or a tensor.
         desired_kl: the KL of an update that is aimed at.
         low: lower bound of the rate.
         high: upper bound of the rate.
@@ -34,10 +34,12 @@ class AdaptiveRate:
 
     def step(self, kl: Tensor) -> None:
         """Adapt the rate to the KL of an update; one that is not a number leaves it as it is."""
-        value = kl.item() if kl.device.type == "cpu" else kl  # numbers are cheaper, where nobody waits
-        small, large = (value > 0) * (value < self.desired_kl / 2), value > 2 * self.desired_kl
-        factor = 1.5 ** (small * 1 - large * 1)
         for group in self.optimizer.param_groups:
-            rate = group["lr"] * factor
-            bounds = self.low, self.high
-            group["lr"] = rate.clamp(*bounds) if isinstance(rate, Tensor) else sorted((*bounds, rate))[1]
+            rate = group["lr"]
+            value = kl if isinstance(rate, Tensor) else kl.item()  # numbers are cheaper, where nobody waits
+            small, large = (value > 0) * (value < self.desired_kl / 2), value > 2 * self.desired_kl
+            factor = 1.5 ** (small * 1 - large * 1)
+            if isinstance(rate, Tensor):
+                rate.mul_(factor).clamp_(self.low, self.high)
+            else:
+                group["lr"] = sorted((self.low, self.high, rate * factor))[1]

@@ -8,16 +8,20 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.collectors import Collector
 from tqdm import tqdm
 
 from torchrl_sym.checks import function, instance
 from torchrl_sym.recipes.checkpoint import (
+    own_part,
+    random_state,
+    require_same_ranks,
     require_same_run,
     restore,
     restore_random,
@@ -26,10 +30,13 @@ from torchrl_sym.recipes.checkpoint import (
 )
 from torchrl_sym.recipes.config import PPOConfig
 from torchrl_sym.recipes.environment import MakeEnv, Staggered, measure, offered, seed_unless_own
+from torchrl_sym.recipes.fetching import fetch
+from torchrl_sym.recipes.finite import finite, require_finite, vital
 from torchrl_sym.recipes.learner import Learner
-from torchrl_sym.recipes.metrics import Episodes, symmetry_metrics
+from torchrl_sym.recipes.metrics import SYMMETRY_METRICS, Episodes, symmetry_means
 from torchrl_sym.recipes.networks import make_networks
 from torchrl_sym.recipes.normalizers import RewardScale, observe
+from torchrl_sym.recipes.ranks import Ranks
 from torchrl_sym.recipes.storage import RunFolder, make_logger, require_logger
 from torchrl_sym.symmetry import Symmetry
 
@@ -104,6 +111,11 @@ def train(
     called first, so that batches hold all phases of an episode. What else it may offer:
     :mod:`torchrl_sym.recipes.environment`.
 
+    Called in several processes, as ``torchrun`` starts them, after
+    ``torch.distributed.init_process_group``, they share the training (:mod:`torchrl_sym.recipes.ranks`):
+    ``config`` is that of the whole, each process has its part of ``config.num_envs``, all yield the same
+    metrics, and only the first one writes.
+
     Args:
         config: hyper-parameters.
         make_env: called with ``num_envs`` and ``seed``. An environment that cannot save its state is seeded
@@ -151,7 +163,7 @@ def train(
     earlier = None if start_from is None else RunFolder(start_from)
     require_logger(logger)
     if storage is not None:
-        storage.lock()
+        Ranks().first(storage.lock)
     try:
         run = _Run(config, make_env, symmetry, storage, earlier)
     except BaseException:
@@ -172,11 +184,12 @@ class _Run:
         folder: RunFolder | None,
         start_from: RunFolder | None,
     ) -> None:
-        self.config, self.folder = config, folder
+        self.config, self.folder, self.ranks = config, folder, Ranks()
+        share, seed = self.ranks.share("num_envs", config.num_envs), self.ranks.seed(config.seed)
         torch.manual_seed(config.seed)
-        self.env = make_env(num_envs=config.num_envs, seed=config.seed)
+        self.env = make_env(num_envs=share, seed=seed)
         try:
-            seed_unless_own(self.env, config.seed)
+            seed_unless_own(self.env, seed)
             symmetry.check_specs(self.env)
             self.symmetry = symmetry
             actor, critic = make_networks(config, self.env, self.symmetry)
@@ -184,11 +197,13 @@ class _Run:
             self.rewards = None
             if config.normalize_rewards:
                 self.rewards = RewardScale(config.num_envs, config.gamma).to(config.device)
-            self.episodes = Episodes(self.env)
+            self.episodes = Episodes(self.env, self.ranks.count)
             self.done, self.seconds = 0, 0.0
+            if self.ranks.index > 0:  # networks were drawn alike, exploration must not be
+                torch.manual_seed(seed)
             if not self._continue():
                 self._begin(start_from)
-            self.random = torch.get_rng_state()  # of the moment it begins, whatever is drawn until then
+            self.random = random_state(config.device)  # of now, whatever is drawn until it begins
         except BaseException:
             self.env.close()
             raise
@@ -200,33 +215,42 @@ class _Run:
 
     def _continue(self) -> bool:
         """Go on from the folder's checkpoint, if it has one that something has been learned for."""
-        checkpoint = None if self.folder is None else self.folder.load()
-        if self.folder is None or checkpoint is None:
-            if self.folder is not None:
-                self.folder.table.require_empty()
+        if self.folder is None:
             return False
-        require_same_run(self.folder, checkpoint, self.config, self.env)
-        self.folder.table.truncate(checkpoint["iteration"])
-        if checkpoint["iteration"] == 0:
+        checkpoint = self.ranks.first(self._load)
+        if checkpoint is None:
             return False
         self.done, self.seconds = checkpoint["iteration"], checkpoint["seconds"]
-        if self.done < self.config.iterations:
+        if 0 < self.done < self.config.iterations:
+            checkpoint = own_part(checkpoint, self.ranks)
             restore(self.folder, checkpoint, self.env, self.parts, self.episodes)
-            restore_random(checkpoint)
+            restore_random(checkpoint, self.config.device)
             warn_unless_exact(self.env)
-        return True
+        return self.done > 0
+
+    def _load(self) -> dict[str, Any] | None:
+        """The checkpoint of this very run, whose table is cut back to it."""
+        assert self.folder is not None
+        checkpoint = self.folder.load()
+        if checkpoint is None:
+            self.folder.table.require_empty()
+        else:
+            require_same_run(self.folder, checkpoint, self.config, self.env, self.ranks)
+            self.folder.table.truncate(checkpoint["iteration"])
+        return checkpoint
 
     def _begin(self, start_from: RunFolder | None) -> None:
         """Begin, from another run or with episodes at all of their phases."""
         if start_from is not None:
-            earlier, parts = start_from.load(), self.parts
+            earlier, parts = self.ranks.first(start_from.load), self.parts
             found = [] if earlier is None else list(earlier["parts"])
             if earlier is None or set(parts) - set(found):
                 raise FileNotFoundError(
                     f"expected a checkpoint with {list(parts)} in {start_from.path} to start from, found "
                     f"{found}; train there first"
                 )
-            restore(start_from, earlier, self.env, parts, self.episodes)
+            require_same_ranks(start_from, earlier, self.ranks)
+            restore(start_from, own_part(earlier, self.ranks), self.env, parts, self.episodes)
             warn_unless_exact(self.env)
         elif (staggered := offered(self.env, Staggered)) is not None:
             staggered.stagger()
@@ -235,46 +259,41 @@ class _Run:
 
     def iterations(self, logger: str | None, progress: bool) -> Generator[dict[str, float]]:
         """Collect and learn, yielding the metrics of every iteration."""
-        config, learner, episodes = self.config, self.learner, self.episodes
+        config, learner = self.config, self.learner
         if self.done >= config.iterations:
             self.close()
             return
-        torch.set_rng_state(self.random)
+        restore_random(self.random, config.device)
         learner.policy.begin(config, self.done + 1)
-        elsewhere = None if config.device == "cpu" else config.device
+        # on one device, the collector need not wait for copies
+        elsewhere = None if _same(config.device, self.env.device) else config.device
+        writes = self.ranks.index == 0
         collector = Collector(
             self.env,
             learner.actor,
-            frames_per_batch=config.num_envs * config.horizon,
+            frames_per_batch=self.env.batch_size.numel() * config.horizon,
             total_frames=-1,
             policy_device=elsewhere,
             storing_device=elsewhere,
             auto_register_policy_transforms=False,
             track_traj_ids=False,
         )
-        log = make_logger(logger, None if self.folder is None else self.folder.path, name="train")
-        bar = tqdm(total=config.iterations, initial=self.done, disable=not progress, unit="it")
+        log = make_logger(logger if writes else None, self.folder and self.folder.path, name="train")
+        bar = tqdm(total=config.iterations, initial=self.done, disable=not (progress and writes), unit="it")
         began = time.perf_counter()
         clock = began - self.seconds
         try:
-            for data in collector:
+            for batch in collector:
                 self.done += 1
+                data = self.ranks.gather(batch)
                 metrics: dict[str, float] = {"iteration": self.done, "frames": self.done * data.numel()}
                 metrics["collect_seconds"] = time.perf_counter() - began
-                _require_finite(data, {*learner.actor.in_keys, *learner.critic.in_keys})
-
-                metrics["return"] = episodes.update(data)
-                metrics |= measure(self.env)
-                metrics |= symmetry_metrics(learner.actor, self.symmetry, data)
-                metrics |= learner.learn(data if self.rewards is None else self.rewards(data))
-                for network in (learner.actor, learner.critic):
-                    observe(network, data)
-                metrics["std"] = float(data["scale"][..., 0, :].mean())
-
+                metrics |= self._learn(data)
                 self.seconds = metrics["seconds"] = time.perf_counter() - clock
                 metrics["frames_per_second"] = metrics["frames"] / metrics["seconds"]
                 if self.folder is not None:
-                    self.folder.table.append(metrics)
+                    if writes:
+                        self.folder.table.append(metrics)
                     if self.done % config.checkpoint_interval == 0 or self.done >= config.iterations:
                         self._save()
                 if log is not None:
@@ -295,10 +314,42 @@ class _Run:
             collector.shutdown(close_env=True)
             self.close()
 
+    def _learn(self, data: TensorDictBase) -> dict[str, float]:
+        """Measure a batch ``[*env, T]`` and learn from it; the host waits once, when all is queued."""
+        learner = self.learner
+        names = vital([*learner.actor.in_keys, *learner.critic.in_keys])
+        measured = measure(self.env)
+        pending = {
+            "finite": finite(data, names),
+            "reward": data["next", "reward"],
+            "done": data["next", "done"],
+            "symmetry": symmetry_means(learner.actor, self.symmetry, data),
+            "std": data["scale"][..., 0, :].mean(),
+            **{f"env {name}": value for name, value in measured.items() if isinstance(value, Tensor)},
+        }
+        if not self.config.accelerated:  # else it is asked below, with everything else
+            require_finite(data, names, pending["finite"])
+        pending |= learner.fit(learner.estimate(data if self.rewards is None else self.rewards(data)))
+        for network in (learner.actor, learner.critic):
+            observe(network, data)
+
+        known = fetch(pending)
+        require_finite(data, names, known["finite"])
+        measured = {name: float(known.get(f"env {name}", value)) for name, value in measured.items()}
+        return {
+            "return": self.episodes.add(known["reward"], known["done"]),
+            **self.ranks.mean(measured),
+            **dict(zip(SYMMETRY_METRICS, known["symmetry"].tolist(), strict=True)),
+            **learner.report(known),
+            "std": float(known["std"]),
+        }
+
     def _save(self) -> None:
-        assert self.folder is not None
-        state = (self.parts, self.episodes, self.done, self.seconds)
-        self.folder.save(snapshot(self.config, self.env, *state))
+        folder = self.folder
+        assert folder is not None
+        state = (self.parts, self.episodes, self.done, self.seconds, self.ranks)
+        checkpoint = snapshot(self.config, self.env, *state)
+        self.ranks.first(lambda: folder.save(checkpoint))
 
     def close(self) -> None:
         """Give up the folder and the environment."""
@@ -308,14 +359,7 @@ class _Run:
             self.env.close()
 
 
-def _require_finite(data: TensorDictBase, keys: Iterable[NestedKey]) -> None:
-    """FloatingPointError, which names the entry, unless observations, actions and rewards are finite."""
-    names = [*keys, *(("next", key) for key in keys), "action", ("next", "reward")]
-    flags = [data.get(name).isfinite().all() for name in names]
-    for name in (name for name, good in zip(names, torch.stack(flags).tolist(), strict=True) if not good):
-        wrong = data.get(name).isfinite().logical_not()
-        bad = int(wrong.flatten(data.ndim).any(-1).sum())
-        raise FloatingPointError(
-            f"expected finite numbers, got others in {name!r} of {bad} of {data.numel()} samples; end "
-            "episodes before the simulation diverges"
-        )
+def _same(device: str, other: torch.device | None) -> bool:
+    """Whether the environment's device is that of the networks; ``cuda`` is the current one of its kind."""
+    places = [torch.empty(0, device=each or "cpu").device for each in (device, other)]
+    return places[0] == places[1]
