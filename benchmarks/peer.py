@@ -28,7 +28,7 @@ class Simulation:
     cfg: dict = {}  # noqa: RUF012
 
     def __init__(self, env: BatchedEnv) -> None:
-        self.env, self.symmetry, self.device = env, env.symmetry, "cpu"
+        self.env, self.symmetry, self.device = env, env.symmetry, str(env.device or "cpu")
         (self.num_envs,), self.num_actions = env.batch_size, env.action_spec.shape[-1]
         self.max_episode_length = env.task.max_steps
         env.stagger()
@@ -64,7 +64,7 @@ class Peer:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints its networks
             observations = self.simulation.get_observations()
             self.algorithm = PPO.construct_algorithm(
-                observations, self.simulation, configuration(config), "cpu"
+                observations, self.simulation, configuration(config), config.device
             )
         if not metric and self.algorithm.symmetry is not None:
             self.algorithm.symmetry.compute_loss = lambda *_: torch.zeros(())
