@@ -26,8 +26,8 @@ from typing_extensions import Self  # of typing since Python 3.11
 
 from tasks.constants import Constant
 from tasks.draws import device_of, put
+from tasks.engine import Engine
 from tasks.observation import Entry, Observation
-from tasks.simulation import Simulation
 from tasks.state import Element, State, concatenate
 from torchrl_sym import PointGroup, Representation, Symmetry, checks
 from torchrl_sym.mujoco import derive
@@ -196,9 +196,9 @@ class Task(abc.ABC):
         return self.sample_initial_state(len(finished), generator)
 
     def randomize(  # noqa: B027  (optional, so not abstract)
-        self, simulation: Simulation, ids: Tensor, generator: torch.Generator | None
+        self, simulation: Engine, ids: Tensor, generator: torch.Generator | None
     ) -> None:
-        """Randomise the physics of rows about to start (``Simulation.expand``); off by default.
+        """Randomise the physics of rows about to start (``Engine.expand``); off by default.
 
         Draw values whose distribution the group maps onto itself, or the task stops being
         symmetric.
@@ -210,7 +210,7 @@ class Task(abc.ABC):
             generator: the environment's generator; draw from nothing else.
         """
 
-    def scale_friction(self, simulation: Simulation, ids: Tensor, factor: Tensor) -> None:
+    def scale_friction(self, simulation: Engine, ids: Tensor, factor: Tensor) -> None:
         """Multiply the model's sliding friction, of all geoms, by a factor per row, ``(len(ids),)``."""
         put(simulation.expand("geom_friction")[..., 0], ids, factor[:, None] * self._friction.like(factor))
 

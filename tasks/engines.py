@@ -7,12 +7,12 @@ keeps the state there; it is imported when it is asked for, since it is an extra
 
 from __future__ import annotations
 
-import importlib
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import torch
 
 from tasks.base import Task
+from tasks.engine import Engine
 from tasks.simulation import Simulation
 from torchrl_sym import checks
 from torchrl_sym.extras import require
@@ -27,8 +27,8 @@ def make_engine(
     num_threads: int = 2,
     device: torch.device | str | None = None,
     engine: EngineName | None = None,
-) -> Any:
-    """The simulations of an environment: whoever has the public methods of ``Simulation``.
+) -> Engine:
+    """The simulations of an environment.
 
     Args:
         task: whose model is simulated.
@@ -55,5 +55,6 @@ def make_engine(
         return Simulation(task.model, num_envs, num_threads, max_velocity=task.max_velocity)
     remedy = "or engine='mujoco', on CPU threads"
     require("the physics on a GPU", "gpu", {"mujoco_warp": "3.17", "warp": "1.19"}, remedy)
-    module = importlib.import_module("tasks.warp_simulation")
-    return module.WarpSimulation(task.model, num_envs, place, max_velocity=task.max_velocity)
+    from tasks.warp_simulation import WarpSimulation
+
+    return WarpSimulation(task.model, num_envs, place, max_velocity=task.max_velocity)
