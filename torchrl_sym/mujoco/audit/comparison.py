@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torchrl_sym.mujoco.audit.report import Kind, Residual
 from torchrl_sym.mujoco.audit.scales import Efforts
 from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
-from torchrl_sym.mujoco.model.links import links_of
 from torchrl_sym.mujoco.model.types import Array, name_of
 
 
@@ -20,7 +19,6 @@ class Comparison:
         self.matcher = self.action.matcher
         self.data, self.image = self.matcher.data, self.matcher.image
         self.links = self.matcher.links
-        self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
         self.element, self.efforts = symmetry.group.names[g], efforts
         self.worst: dict[str, Residual] = {}

@@ -177,7 +177,7 @@ def _buckets(turning: Turning) -> list[list[int]]:
     for b in parts.loose:
         links = [parts.links[x] for x in parts.tree(b)]
         kinds = tuple(sorted(int(model.jnt_type[j]) for link in links for j in link.joints))
-        moments = np.linalg.eigvalsh(links[0].inertia)
+        moments = np.linalg.eigvalsh(parts.inertias[b])
         numbers = np.array([sum(link.mass for link in links), _reach(parts, b), *moments])
         key = (len(links), kinds, bool(model.body_mocapid[b] >= 0))
         for other, near, members in found:

@@ -30,7 +30,7 @@ class Matcher:
         data: kinematics at the reference pose, places relative to the axis.
         extent: size of the largest tree of moving links, which lengths are made relative to.
         image: kinematics where images are looked for: the reference pose, carried bodies turned by R.
-        links: from :func:`~torchrl_sym.mujoco.model.links.links_of`.
+        skeleton, links: how the model's links hang together.
         carried: bodies that are only carried along, so that their frames turn with the world.
         shift: (I - R) axis, what R adds to a point of the world.
         images: image of every link, as a map of body numbers.
@@ -39,12 +39,8 @@ class Matcher:
     def __init__(
         self, parts: Parts, matrix: Array, lift: Array, axis: Array, loose: dict[int, int]
     ) -> None:
-        self.model, self.data, self.links, self.carried = (
-            parts.model,
-            parts.data,
-            parts.links,
-            parts.carried,
-        )
+        self.model, self.data, self.carried = parts.model, parts.data, parts.carried
+        self.skeleton, self.links = parts.skeleton, parts.links
         self.matrix, self.lift, self.axis = matrix, lift, axis
         self.det = round(float(np.linalg.det(matrix)))
         self.shift = axis - matrix @ axis

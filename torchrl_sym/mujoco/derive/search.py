@@ -15,11 +15,14 @@ import numpy as np
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.axis import find_axis
+from torchrl_sym.mujoco.derive.explanation import explain
+from torchrl_sym.mujoco.derive.hints import range_gaps
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.derive.loose import Standing, generators, stand
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.solving import solved
+from torchrl_sym.mujoco.model.links import Skeleton
 from torchrl_sym.mujoco.model.poses import Pose, kinematics, poses, shift
 from torchrl_sym.mujoco.model.rotations import quaternion
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjModel, label_of
@@ -78,6 +81,7 @@ class Search:
         self.model, self.group, self.lifts, self.tolerance = model, group, lifts, tolerance
         self.carried, self.axis = carried, axis
         self.matrices = group.matrices.numpy()
+        self.skeleton = Skeleton(model)
 
     def find(self, keyframe: int | str | None) -> Stance:
         """The first stance that fits.
@@ -95,7 +99,7 @@ class Search:
                 break
         if keyframe is None and not tried[-1].standing.hopeless:
             start = tried[0]
-            pose = solved(self.model, self.group, start.pose, start.axis, self.carried, self.tolerance)
+            pose = solved(self.skeleton, self.group, start.pose, start.axis, self.carried, self.tolerance)
             if pose is not None and self._in_range(stance := self._at(pose)):
                 tried.append(stance)
         best = min(tried, key=lambda stance: stance.misfit)
@@ -105,7 +109,7 @@ class Search:
         return self._settled(best if best.misfit <= _CLEARLY * first.misfit else first)
 
     def _at(self, pose: Pose) -> Stance:
-        model, parts = self.model, Parts.of(self.model, kinematics(self.model, pose), self.carried)
+        model, parts = self.model, Parts.of(self.skeleton, kinematics(self.model, pose), self.carried)
         if self.axis is None:
             axis = find_axis(parts, self.matrices[generators(self.group)], self.tolerance)[0]
         else:
@@ -115,7 +119,7 @@ class Search:
         shift(data, -axis)
         # the points of loose trees that are on the axis now, as high as their images
         points = {b: data.xpos[b] + standing.turns[b] @ standing.points[b] for b in standing.turns}
-        parts = Parts.of(model, data, self.carried).about(points)
+        parts = Parts.of(self.skeleton, data, self.carried).about(points)
         matchers = [
             Matcher(parts, matrix, lift, axis, images)
             for matrix, lift, images in zip(self.matrices, self.lifts, standing.images, strict=True)
@@ -146,9 +150,8 @@ class Search:
     def _in_range(self, stance: Stance) -> bool:
         """Whether a pose that was solved for fits, and sends ranges of joints to ranges."""
         return stance.misfit <= 1 and all(
-            matcher.pairing.range_gap(i, j) <= _RANGE
+            (range_gaps(matcher.pairing.gaps, list(matcher.joints().items())) <= _RANGE).all()
             for matcher in stance.matchers
-            for i, j in matcher.joints().items()
         )
 
     def _settled(self, stance: Stance) -> Stance:
@@ -199,7 +202,7 @@ class Search:
             for name, matcher in zip(names, best.matchers, strict=True)
         ]
         misfit, name, matcher = next(f for f in found if f[0].size > 1)
-        reason = matcher.pairing.explain(misfit, name, tolerance)
+        reason = explain(matcher.pairing, misfit, name, tolerance)
         if misfit.kind == "missing":
             raise SymmetryError(reason)
         words = list(dict.fromkeys(stance.words for stance in tried))

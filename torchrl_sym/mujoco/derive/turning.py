@@ -60,7 +60,7 @@ class Turning:
         frame = self.parts.data.xmat[tree].reshape(3, 3)
         if self.is_object(tree):
             yield "upright", frame.T
-            moments, axes = np.linalg.eigh(self.parts.links[tree].inertia)
+            moments, axes = np.linalg.eigh(self.parts.inertias[tree])
             axes[:, 0] *= np.linalg.det(axes)
             if np.ptp(moments) > 1e-6 * moments.max():
                 for k in range(3):
@@ -122,8 +122,8 @@ class Turning:
         size = self.parts.sizes[b]
         gaps = [float(np.linalg.norm(matrix @ self.parts.centers[a] - self.parts.centers[b])) / size]
         gaps.append(abs(one.mass - other.mass) / max(one.mass, other.mass, 1e-12))
-        inertia = matrix @ one.inertia @ matrix.T - other.inertia
-        gaps.append(float(np.abs(inertia).max()) / max(float(np.trace(other.inertia)), 1e-12))
+        inertia = matrix @ self.parts.inertias[a] @ matrix.T - self.parts.inertias[b]
+        gaps.append(float(np.abs(inertia).max()) / max(float(np.trace(self.parts.inertias[b])), 1e-12))
         gaps.append(
             float(np.abs(self._hull(a, DIRECTIONS @ matrix) - self._hull(b, DIRECTIONS)).max()) / size
         )
