@@ -11,6 +11,7 @@ import numpy as np
 from torchrl_sym.mujoco.derive.chains import JointPairs
 from torchrl_sym.mujoco.derive.pairing import Misfit, Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
+from torchrl_sym.mujoco.model.links import is_loose
 from torchrl_sym.mujoco.model.poses import shift
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, mj
@@ -47,7 +48,11 @@ class Matcher:
         self.extent = parts.extent
         self.image = self._carry() if self.carried else self.data
         self.pairing = Pairing(parts, matrix)
-        self.images = self.pairing.images(0, 0, loose | {b: b for b in self.carried})
+        self.is_identity = np.array_equal(matrix, np.eye(3))
+        if self.is_identity:
+            self.images = {b: b for b in self.links}
+        else:
+            self.images = self.pairing.images(0, 0, loose | {b: b for b in self.carried})
 
     def _carry(self) -> MjData:
         model, data, image = self.model, self.data, mj.MjData(self.model)
@@ -73,10 +78,18 @@ class Matcher:
 
     def misfit(self, tolerance: float) -> Misfit:
         """The worst pair of links or joints; above 1 this is no symmetry."""
+        if self.is_identity:
+            return Misfit(0.0)
         missing = [b for b in self.links[0].children if b not in self.images]
         if missing:
             return Misfit(np.inf, "missing", missing[0])
         return self.pairing.worst(self.images, tolerance)
+
+    def ambiguous(self) -> list[tuple[int, int]]:
+        """Pairs of links that nothing tells apart."""
+        if self.is_identity:  # of which nothing else asks how alike links are
+            self.pairing.images(0, 0, {b: b for b in self.links[0].children if is_loose(self.model, b)})
+        return self.pairing.ambiguous(self.images)
 
     def joints(self) -> dict[int, int]:
         """Image of every joint, if every link has one."""

@@ -45,7 +45,7 @@ class Misfit:
     other: int = 0
 
 
-@dataclass
+@dataclass(slots=True)
 class _Siblings:
     """Two sets of siblings, one of which is to be mapped into the other.
 
@@ -69,6 +69,9 @@ class _Siblings:
             return [(a, b) for a in self.mine for b in self.theirs]
         rows = zip(self.mine, self.compared.tolist(), strict=True)
         return [(a, self.theirs[k]) for a, places in rows for k in places]
+
+
+_NONE = _Siblings([], [])  # of links without children, of which most pairs are
 
 
 class Pairing:
@@ -152,6 +155,8 @@ class Pairing:
         self._assign(found)
 
     def _siblings(self, mine: Sequence[int], theirs: Sequence[int]) -> _Siblings:
+        if not mine and not theirs:
+            return _NONE
         if not mine or len(theirs) <= _NEAREST:
             return _Siblings(mine, theirs)
         ends = self.gaps.centers[list(mine)], self.parts.centers[list(theirs)]
@@ -203,6 +208,8 @@ class Pairing:
         """Find the best pairs of the children of pairs of links, each of which comes after its parents."""
         for pair in reversed(pairs):
             below = self._below[pair]
+            if below is _NONE:
+                continue
             mine, theirs = below.mine, below.theirs
             rest = _MISFIT * abs(len(mine) - len(theirs))
             if not mine or not theirs:

@@ -51,7 +51,7 @@ class Stance:
     @property
     def ambiguous(self) -> list[str]:
         """Sentences on parts that nothing tells apart."""
-        pairs = {pair for m in self.matchers for pair in m.pairing.ambiguous(m.images)}
+        pairs = {pair for matcher in self.matchers for pair in matcher.ambiguous()}
         model = self.matchers[0].model
         names = [[label_of(model, "body", b) for b in pair] for pair in sorted(pairs)]
         return [*self.standing.ambiguous, *(f"{a} and {b} are alike and in one place" for a, b in names)]

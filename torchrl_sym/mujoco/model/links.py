@@ -64,6 +64,7 @@ class Skeleton:
         masses: of links by body number, of other bodies zero, ``(nbody,)``; the world's is its own body's.
         total_mass: of all that moves.
         joint_links: the link of every joint, ``(njnt,)``.
+        kinds: types of joints.
         fixed: trees that hang on the world.
         loose: trees that nothing holds.
     """
@@ -92,6 +93,7 @@ class Skeleton:
             link.mass = float(self.masses[body])
 
         self.total_mass = max(float(self.masses[1:].sum()), _NO_MASS)
+        self.kinds: list[int] = model.jnt_type.tolist()
         self.joint_links = self.owner[model.jnt_bodyid]
         trees = self.links[0].children
         self.fixed = [b for b in trees if not is_loose(model, b)]
