@@ -321,7 +321,3 @@ class Pairing:
                 if abs(now - swapped) < 1e-6:
                     found.append((a, c))
         return found
-
-    def sign(self, i: int, j: int) -> float:
-        """Sign between the coordinates of two hinges or slides that are images of each other."""
-        return float(self.gaps.signs([(i, j)])[0])

@@ -16,13 +16,14 @@ import numpy as np
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.axis import find_axis
 from torchrl_sym.mujoco.derive.explanation import explain
+from torchrl_sym.mujoco.derive.gaps import columns
 from torchrl_sym.mujoco.derive.hints import range_gaps
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.derive.loose import Standing, generators, stand
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.solving import solved
-from torchrl_sym.mujoco.model.links import Skeleton
+from torchrl_sym.mujoco.model.links import Numbers, Skeleton
 from torchrl_sym.mujoco.model.poses import Pose, kinematics, poses, shift
 from torchrl_sym.mujoco.model.rotations import quaternion
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjModel, label_of
@@ -172,27 +173,28 @@ class Search:
         sums = np.zeros(model.nq)
         on_line = np.isin(model.jnt_type, (HINGE, SLIDE))
         for matcher in stance.matchers:
-            for i, j in matcher.joints().items():
-                if on_line[i]:
-                    sign = matcher.pairing.sign(i, j)
-                    start, end = model.jnt_qposadr[[i, j]]
-                    offset = float(qpos[end] - sign * qpos[start])
-                    limit = _SNAP
-                    if int(model.jnt_type[i]) == SLIDE:
-                        limit *= matcher.pairing.parts.size(int(model.jnt_bodyid[i]))
-                    sums[end] += sign * qpos[start] + self._snapped(i, j, sign, offset, limit, by_ranges)
+            pairs = [(i, j) for i, j in matcher.joints().items() if on_line[i]]
+            (i, j), signs = columns(pairs), matcher.pairing.gaps.signs(pairs)
+            moved, ends = signs * qpos[model.jnt_qposadr[i]], model.jnt_qposadr[j]
+            sizes = matcher.pairing.parts.link_sizes[self.skeleton.joint_links[i]]
+            limits = _SNAP * np.where(model.jnt_type[i] == SLIDE, sizes, 1.0)
+            sums[ends] += moved + self._snapped(i, j, signs, qpos[ends] - moved, limits, by_ranges)
         even = qpos.copy()
         address = model.jnt_qposadr[on_line]
         even[address] = sums[address] / len(stance.matchers)
         return even
 
-    def _snapped(self, i: int, j: int, sign: float, offset: float, limit: float, by_ranges: bool) -> float:
-        """An offset, or the one near it that is meant: none, or that between the ranges."""
-        meant = [0.0]
-        if self.model.jnt_limited[i] and self.model.jnt_limited[j]:
-            middles = self.model.jnt_range[[i, j]].mean(axis=1)
-            meant.insert(0 if by_ranges else 1, float(middles[1] - sign * middles[0]))
-        return next((value for value in meant if abs(value - offset) < limit), offset)
+    def _snapped(
+        self, i: Numbers, j: Numbers, signs: Array, offsets: Array, limits: Array, by_ranges: bool
+    ) -> Array:
+        """Offsets, or those near them that are meant: none, or those between the ranges."""
+        limited, middles = self.model.jnt_limited != 0, self.model.jnt_range.mean(axis=1)
+        between = middles[j] - signs * middles[i]
+        none_near = np.abs(offsets) < limits
+        between_near = limited[i] & limited[j] & (np.abs(between - offsets) < limits)
+        first, second = (between_near, none_near) if by_ranges else (none_near, between_near)
+        meant, other = (between, 0.0) if by_ranges else (0.0, between)
+        return np.where(first, meant, np.where(second, other, offsets))
 
     def _refuse(self, tried: list[Stance]) -> NoReturn:
         best = min(tried, key=lambda stance: stance.misfit)
