@@ -130,10 +130,7 @@ class Pairing:
         while stack:
             a, b = stack.pop()
             images[a] = b
-            if (
-                a,
-                b,
-            ) not in self._below:  # too far apart to be compared, but nothing else is left
+            if (a, b) not in self._below:  # they were too far apart to be compared
                 self._compare([(a, b)])
             stack += self._below[a, b].pairs
         return dict(sorted(images.items()))
