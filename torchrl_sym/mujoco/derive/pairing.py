@@ -226,7 +226,7 @@ class Pairing:
         return self._own[a, b] + self._below[a, b].cost
 
     def _table(self, below: _Siblings) -> Array:
-        if below.costs is None:
+        if below.costs is None or below.compared is None:
             return np.array([[self._cost(a, b) for b in below.theirs] for a in below.mine])
         table = below.costs.copy()
         costs = [self._cost(a, b) for a, b in below.candidates()]
