@@ -270,9 +270,9 @@ def test_what_nothing_tells_apart_is_said():
     ],
 )
 def test_names_of_the_other_side(name, image):
-    assert counterparts(name, sides=True, ends=False) == [image]
+    assert counterparts(name, sides=True, ends=False) == (image,)
     assert name in counterparts(image, sides=True, ends=False)
-    assert counterparts("torso_roller", sides=True, ends=True) == []
+    assert counterparts("torso_roller", sides=True, ends=True) == ()
 
 
 def test_messages_say_degrees_and_millimetres_and_where_unnamed_bodies_are():

@@ -13,28 +13,29 @@ def compare_links(c: Comparison) -> None:
     model, turn = c.model, c.matcher.matrix
     moving = {body: link for body, link in c.links.items() if body}  # the world's own mass does not matter
     trees = {body: int(model.body_rootid[body]) for body in moving}  # an object is judged beside no robot
+    here, there = (c.matcher.skeleton.lumps(pose) for pose in (c.data, c.image))
     masses, inertias = dict.fromkeys(trees.values(), 1e-12), dict.fromkeys(trees.values(), 1e-12)
     for body, link in moving.items():
         masses[trees[body]] += link.mass
-        lever = float(np.linalg.norm(link.com - c.data.xpos[link.body]))
-        felt = float(np.abs(link.inertia).max()) + link.mass * lever**2  # about where it is held
+        lever = float(np.linalg.norm(here.centers[body] - c.data.xpos[body]))
+        felt = float(np.abs(here.inertias[body]).max()) + link.mass * lever**2  # about where it is held
         inertias[trees[body]] = max(inertias[trees[body]], felt)
 
     for a, b in c.map.bodies.items():
         if a == 0:
             continue
-        one, other, name = c.links[a], c.image_links[b], c.name("body", a, b)
+        one, other, name = c.links[a], c.links[b], c.name("body", a, b)
         total = masses[trees[a]]
         c.add("mass", abs(one.mass - other.mass) / total, name)
         if min(one.mass, other.mass) > 0:
-            offset = float(np.linalg.norm(turn @ one.com - other.com))
+            offset = float(np.linalg.norm(turn @ here.centers[a] - there.centers[b]))
             c.add("centre of mass", offset / c.matcher.size(a), name, amount=f"{1e3 * offset:.2g} mm")
         quaternions = [
             float(np.abs(np.linalg.norm(model.body_quat[x.bodies], axis=1) - 1).max()) for x in (one, other)
         ]
         c.add("body rotation", abs(quaternions[0] - quaternions[1]), name)
-        image = turn @ one.inertia @ turn.T
-        c.add("inertia", float(np.abs(image - other.inertia).max()) / inertias[trees[a]], name)
+        image = turn @ here.inertias[a] @ turn.T
+        c.add("inertia", float(np.abs(image - there.inertias[b]).max()) / inertias[trees[a]], name)
         if model.body_gravcomp.any():
             lift = [model.body_mass[x.bodies] @ model.body_gravcomp[x.bodies] for x in (one, other)]
             c.add("gravity compensation", abs(float(lift[0] - lift[1])) / total, name)

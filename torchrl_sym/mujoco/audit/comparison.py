@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from torchrl_sym.mujoco.audit.report import Kind, Residual
 from torchrl_sym.mujoco.audit.scales import Efforts
 from torchrl_sym.mujoco.derive.symmetry import ModelSymmetry
-from torchrl_sym.mujoco.model.links import links_of
 from torchrl_sym.mujoco.model.types import Array, name_of
 
 
@@ -20,9 +19,9 @@ class Comparison:
         self.matcher = self.action.matcher
         self.data, self.image = self.matcher.data, self.matcher.image
         self.links = self.matcher.links
-        self.image_links = links_of(self.model, self.image)
         self.map = self.action.coordinates
         self.element, self.efforts = symmetry.group.names[g], efforts
+        self._columns: dict[tuple[str, bytes | None], tuple[Array, Array]] = {}
         self.worst: dict[str, Residual] = {}
         self.unchecked: list[str] = []
         self.untold: list[str] = []
@@ -34,8 +33,9 @@ class Comparison:
             self.worst[term] = Residual(self.element, term, residual, name, kind, amount)
 
     def name(self, kind: str, a: int, b: int) -> str:
-        name = name_of(self.model, kind, a)
-        return name if a == b else f"{name} -> {name_of(self.model, kind, b)}"
+        names = self.matcher.skeleton.names.get(kind)
+        one, other = (names[x] if names else name_of(self.model, kind, x) for x in (a, b))
+        return one if a == b else f"{one} -> {other}"
 
     def range(
         self,
@@ -64,10 +64,21 @@ class Comparison:
     ) -> None:
         """Model fields that must be equal, relative to the largest among elements of like units."""
         for field in fields:
+            values, scale = self._column(field, alike)
+            if len(scale):
+                self.add(term, float((np.abs(values[i] - values[j]) / scale).max()), name)
+
+    def _column(self, field: str, alike: NDArray[np.intp] | None) -> tuple[Array, Array]:
+        """Values of a field and their scale, which is empty where all are zero."""
+        key = field, None if alike is None else alike.tobytes()
+        if key not in self._columns:
             values = np.asarray(getattr(self.model, field, 0.0), dtype=float)  # some are new in 3.17
-            if not values.any():
-                continue
-            self.values(term, values.reshape(len(values), -1), i, j, name, alike)
+            if values.any():
+                values = values.reshape(len(values), -1)
+                self._columns[key] = values, column_scale(values if alike is None else values[alike])
+            else:
+                self._columns[key] = values, np.zeros(0)
+        return self._columns[key]
 
     def values(
         self, term: str, values: Array, i: int, j: int, name: str, alike: NDArray[np.intp] | None = None

@@ -81,19 +81,26 @@ def contact_warnings(model: MjModel) -> tuple[str, ...]:
 def _unmirrored(model: MjModel) -> Iterator[tuple[list[tuple[int, int]], int]]:
     """Sets of like pairs of geoms whose contacts are not mirrored: the first few, and how many."""
     filters, kinds = Filters(model), model.geom_type
-    cornered = np.zeros(model.ngeom, dtype=int)
-    for g in np.flatnonzero(np.any(filters.may, axis=1, keepdims=True)[filters.of, 0] & (kinds == MESH)):
+    touching = np.any(filters.may, axis=1, keepdims=True)[filters.of, 0]
+    cornered = np.where(touching, 0, -1)  # of what touches nothing it is not asked
+    for g in np.flatnonzero(touching & (kinds == MESH)):
         cornered[g] = _has_many_cornered_face(model, int(g))
     keys = np.stack([filters.of, kinds, cornered], axis=1)
     alike, starts, labels = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(labels.reshape(-1), kind="stable")  # some versions of numpy add a dimension
     members = np.split(order, np.cumsum(np.bincount(labels.reshape(-1)))[:-1])
 
-    for i, j in np.argwhere(np.triu(filters.may[np.ix_(alike[:, 0], alike[:, 0])])):
+    _, samples, sorts = np.unique(alike[:, 1:], axis=0, return_index=True, return_inverse=True)
+    sorts, samples = sorts.reshape(-1), starts[samples]
+    mirrored = np.array([
+        [_is_mirrored(model, *sorted((int(a), int(b)), key=lambda g: int(kinds[g]))) for b in samples]
+        for a in samples
+    ], dtype=bool).reshape(len(samples), len(samples))  # fmt: skip
+    wrong = filters.may[np.ix_(alike[:, 0], alike[:, 0])] & ~mirrored[np.ix_(sorts, sorts)]
+    for i, j in np.argwhere(np.triu(wrong)):
         one, other = sorted((i, j), key=lambda k: (alike[k, 1], starts[k]))
-        if not _is_mirrored(model, int(starts[one]), int(starts[other])):
-            some = itertools.islice(itertools.product(members[one], members[other]), _NAMED)
-            yield [(int(a), int(b)) for a, b in some], len(members[one]) * len(members[other])
+        some = itertools.islice(itertools.product(members[one], members[other]), _NAMED)
+        yield [(int(a), int(b)) for a, b in some], len(members[one]) * len(members[other])
     for pair in sorted(filters.pairs):
         first, second = sorted(pair, key=lambda g: int(kinds[g]))
         known = filters.may[filters.of[first], filters.of[second]]

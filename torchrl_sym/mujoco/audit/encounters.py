@@ -9,12 +9,13 @@ other may be anywhere.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections import Counter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, MjData, MjModel, mj
+from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, MjData, MjModel, mj
 
 POSES = 50
 _CHAIN = 3  # of so many constraints in a row, the last joint still follows the first
@@ -48,42 +49,47 @@ class Encounters:
     @functools.cached_property
     def _counts(self) -> Counter[tuple[int, int]]:
         """In how many poses each pair of sets touches."""
-        model, data, rng = self.model, mj.MjData(self.model), np.random.default_rng(0)
+        model, data = self.model, mj.MjData(self.model)
         data.mocap_pos[:], data.mocap_quat[:] = self.reference.mocap_pos, self.reference.mocap_quat
         counts: Counter[tuple[int, int]] = Counter()
-        for _ in range(POSES):
-            data.qpos[:] = self.reference.qpos
-            for j in range(model.njnt):
-                self._turn(data, j, rng)
-            self._couple(data)
+        for qpos in self._couple(self._drawn()):
+            data.qpos[:] = qpos
             mj.mj_kinematics(model, data)
             mj.mj_collision(model, data)
             touching = np.sort(self.labels[np.array(data.contact.geom).reshape(-1, 2)], axis=1)
-            counts.update({(int(a), int(b)) for a, b in touching})
+            counts.update({(a, b) for a, b in touching.tolist()})
         return counts
 
-    def _turn(self, data: MjData, joint: int, rng: np.random.Generator) -> None:
-        """Give one joint a random position, as far as it is known where it may be."""
-        model, kind = self.model, int(self.model.jnt_type[joint])
-        start, limited = int(model.jnt_qposadr[joint]), bool(model.jnt_limited[joint])
-        if kind in (HINGE, SLIDE) and limited:
-            data.qpos[start] = rng.uniform(*model.jnt_range[joint])
-        elif kind == HINGE:
-            data.qpos[start] = rng.uniform(-np.pi, np.pi)
-        elif kind == BALL:
-            axis = rng.standard_normal(3)
-            angle = rng.uniform(0.0, model.jnt_range[joint, 1] if limited else np.pi)
-            mj.mju_axisAngle2Quat(data.qpos[start : start + 4], axis / np.linalg.norm(axis), angle)
+    def _drawn(self) -> Array:
+        """Random positions of all joints, as far as it is known where they may be, ``(POSES, nq)``."""
+        model, rng = self.model, np.random.default_rng(0)
+        kinds, limited, address = model.jnt_type, model.jnt_limited != 0, model.jnt_qposadr
+        low, high = np.where(limited[:, None], model.jnt_range, (-np.pi, np.pi)).T
+        bounded = np.flatnonzero((kinds == HINGE) | (kinds == BALL) | ((kinds == SLIDE) & limited))
+        runs = [(ball, [*run]) for ball, run in itertools.groupby(bounded, lambda j: kinds[j] == BALL)]
 
-    def _couple(self, data: MjData) -> None:
+        poses = np.tile(self.reference.qpos, (POSES, 1))
+        for qpos in poses:
+            for ball, joints in runs:
+                if not ball:
+                    qpos[address[joints]] = rng.uniform(low[joints], high[joints])
+                    continue
+                for j in joints:
+                    axis, start = rng.standard_normal(3), int(address[j])
+                    angle = rng.uniform(0.0, high[j])
+                    mj.mju_axisAngle2Quat(qpos[start : start + 4], axis / np.linalg.norm(axis), angle)
+        return poses
+
+    def _couple(self, poses: Array) -> Array:
         """Let joints follow those that equality constraints bind them to."""
         model = self.model
         coupled = (model.eq_type == int(mj.mjtEq.mjEQ_JOINT)) & (model.eq_active0 != 0)
         for e in np.tile(np.flatnonzero(coupled), _CHAIN):
             i, j = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
             start, other = (int(model.jnt_qposadr[k]) for k in (i, j))
-            off = data.qpos[other] - model.qpos0[other] if j >= 0 else 0.0
-            data.qpos[start] = model.qpos0[start] + np.polyval(model.eq_data[e, :5][::-1], off)
+            off = poses[:, other] - model.qpos0[other] if j >= 0 else np.zeros(len(poses))
+            poses[:, start] = model.qpos0[start] + np.polyval(model.eq_data[e, :5][::-1], off)
+        return poses
 
     def _drifts(self, body: int) -> bool:
         """Whether a joint between the world and a body has no end, or the body is a mocap body."""

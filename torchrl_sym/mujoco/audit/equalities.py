@@ -35,7 +35,8 @@ def compare_equalities(c: Comparison) -> None:
         if int(model.eq_type[e]) not in EQUALITIES:
             c.unchecked.append(f"equality constraint {label!r}, of an unsupported kind")
             continue
-        residual, _, f = min((constraints.residual(e, f), f != e, f) for f in range(model.neq))
+        found = ((constraints.residual(e, f), f != e, f) for f in constraints.candidates(e))
+        residual, _, f = min(found, default=(1.0, False, e))
         if residual >= 1 and constraints.follows(e):
             c.add(
                 "equality constraints", DISCRETE, f"{label} (no single image, but it follows from others)"
@@ -54,33 +55,52 @@ class _Constraints:
     c: Comparison
     ends: dict[int, tuple[list[int], Array, Array]] = field(default_factory=dict)
     images: dict[int, tuple[list[int], Array, Array]] = field(default_factory=dict)
+    binding: dict[tuple[int, ...], list[int]] = field(default_factory=dict)  # what bind the same parts
 
     def __post_init__(self) -> None:
-        model = self.c.model
+        model, signs = self.c.model, self.c.map.signs
         self.ties = Ties.of(model)
+        self.joints = {j: Image(k, signs.get(j, 1.0)) for j, k in self.c.map.joints.items()}
         for e in range(model.neq):
             if int(model.eq_type[e]) in (_CONNECT, _WELD):
                 self.ends[e] = _ends(model, self.c.data, e)
                 self.images[e] = _ends(model, self.c.image, e)
+            self.binding.setdefault(self._parts(e, self._owners(e)), []).append(e)
+
+    def candidates(self, e: int) -> list[int]:
+        """Constraints of the kind of e that bind the images of what it binds."""
+        owners = self._owners(e)
+        if int(self.c.model.eq_type[e]) in (_CONNECT, _WELD):
+            moved = [self.c.map.bodies[owner] for owner in owners]
+        else:
+            images = self._images(e)
+            if any(x >= 0 and x not in images for x in owners):
+                return []
+            moved = [images[x].index if x >= 0 else -1 for x in owners]
+        return self.binding.get(self._parts(e, moved), [])
+
+    def _owners(self, e: int) -> list[int]:
+        """The links, joints or tendons that a constraint binds; -1 for none."""
+        if e in self.ends:
+            return self.ends[e][0]
+        return [int(self.c.model.eq_obj1id[e]), int(self.c.model.eq_obj2id[e])]
+
+    def _parts(self, e: int, owners: list[int]) -> tuple[int, ...]:
+        return int(self.c.model.eq_type[e]), int(self.c.model.eq_objtype[e]), *sorted(owners)
+
+    def _images(self, e: int) -> dict[int, Image]:
+        return self.joints if int(self.c.model.eq_type[e]) == _JOINT else self.c.action.tendons
 
     def residual(self, e: int, f: int) -> float:
-        """How far the image of constraint e is from constraint f; 1 if they bind other parts."""
-        model = self.c.model
-        if model.eq_type[e] != model.eq_type[f] or model.eq_objtype[e] != model.eq_objtype[f]:
-            return 1.0
-        if int(model.eq_type[e]) in (_JOINT, _TENDON):
+        """How far the image of constraint e is from f, of its kind; 1 if they bind other parts."""
+        if int(self.c.model.eq_type[e]) in (_JOINT, _TENDON):
             return self._polynomial(e, f)
         return self._bodies(e, f)
 
     def _polynomial(self, e: int, f: int) -> float:
         """Coordinates y = p(x) of joints or tendons, about their reference positions."""
         model, is_joint = self.c.model, int(self.c.model.eq_type[e]) == _JOINT
-        signs, joints = self.c.map.signs, self.c.map.joints
-        images = (
-            {j: Image(k, signs.get(j, 1.0)) for j, k in joints.items()}
-            if is_joint
-            else self.c.action.tendons
-        )
+        signs, images = self.c.map.signs, self._images(e)
         mine, theirs = (
             [int(x) for x in (model.eq_obj1id[k], model.eq_obj2id[k])] for k in (e, f)
         )  # -1: none

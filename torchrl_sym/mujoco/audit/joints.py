@@ -15,31 +15,32 @@ def compare_joints(c: Comparison) -> None:
     """Axes, anchors, ranges, stiffness and limits."""
     model, data, turn = c.model, c.data, c.matcher.matrix  # no carried body has an axis
     rest = c.map.qpos @ model.qpos_spring + c.map.qpos_offset
-    for i, j in c.map.joints.items():
+    mine, theirs = (np.array([*x], dtype=np.intp) for x in (c.map.joints, c.map.joints.values()))
+    angles = np.linalg.norm(np.cross(data.xaxis[mine] @ turn.T, data.xaxis[theirs]), axis=1).tolist()
+    lengths = np.linalg.norm(model.jnt_axis, axis=1)
+    gaps = data.xanchor[mine] @ turn.T - data.xanchor[theirs]
+    beside = np.linalg.norm(np.cross(gaps, data.xaxis[theirs]), axis=1)
+    away = np.where(model.jnt_type[mine] == HINGE, beside, np.linalg.norm(gaps, axis=1)).tolist()
+    springs = c.efforts.scale("stiffness", model.jnt_stiffness[model.dof_jntid])[model.jnt_dofadr]
+    alike = {kind: np.flatnonzero(model.jnt_type == kind) for kind in (HINGE, SLIDE, BALL, FREE)}
+    for (i, j), angle, apart in zip(c.map.joints.items(), angles, away, strict=True):
         name, kind = c.name("joint", i, j), int(model.jnt_type[i])
         sign, shift = c.map.signs.get(i, 1.0), c.map.offsets.get(i, 0.0)
-        gap = turn @ data.xanchor[i] - data.xanchor[j]
         if i in c.map.mixed:
             _compare_mixing(c, i, name)
-            gap = np.zeros(3)
         elif kind in (HINGE, SLIDE):
-            axis = data.xaxis[j]
-            angle = float(np.linalg.norm(np.cross(turn @ data.xaxis[i], axis)))
-            length = abs(float(np.linalg.norm(model.jnt_axis[i]) - np.linalg.norm(model.jnt_axis[j])))
+            length = abs(float(lengths[i] - lengths[j]))
             c.add("joint axis", max(angle, length), name, amount=f"{np.degrees(angle):.2g} deg")
-            gap = np.cross(gap, axis) if kind == HINGE else np.zeros(3)
         if kind != FREE:
-            apart = float(np.linalg.norm(gap))
+            apart = 0.0 if kind == SLIDE else apart  # a slide's anchor does not matter
             c.add("joint anchor", apart / c.matcher.extent, name, amount=f"{1e3 * apart:.2g} mm")
         if i not in c.map.mixed:
             c.range("joint range", "jnt_range", "jnt_limited", i, j, sign, shift, name)
             c.range("joint force range", "jnt_actfrcrange", "jnt_actfrclimited", i, j, sign, 0.0, name)
-        same = np.flatnonzero(model.jnt_type == kind)
-        spring = c.efforts.scale("stiffness", model.jnt_stiffness[model.dof_jntid])[model.jnt_dofadr[j]]
-        stiffness = model.jnt_stiffness[[i, j]] / spring
+        stiffness = model.jnt_stiffness[[i, j]] / springs[j]
         c.add("stiffness", float(abs(stiffness[0] - stiffness[1])), name)
-        c.fields("stiffness", ["jnt_stiffnesspoly"], i, j, name, same)
-        c.fields("joint gravity compensation", ["jnt_actgravcomp"], i, j, name, same)
+        c.fields("stiffness", ["jnt_stiffnesspoly"], i, j, name, alike[kind])
+        c.fields("joint gravity compensation", ["jnt_actgravcomp"], i, j, name, alike[kind])
         if model.jnt_limited[i] or model.jnt_limited[j]:
             c.fields("joint solref/solimp", ["jnt_solref", "jnt_solimp", "jnt_margin"], i, j, name)
         if model.jnt_stiffness[i] > 0:

@@ -27,7 +27,11 @@ def _not_linear(model: MjModel) -> list[Array]:
 def compare_tendons(c: Comparison) -> None:
     """Paths, coefficients, ranges, springs and losses."""
     model = c.model
-    lengths = np.array([tendon_length(model, t)[: model.nv] for t in range(model.ntendon)])
+    lengths = np.zeros((model.ntendon, model.nv))
+    for t in range(model.ntendon):
+        lengths[t] = tendon_length(model, t)[: model.nv]
+    losses = {field: np.array(getattr(model, f"tendon_{field}")) for field in _LOSSES.values()}
+    scales = {field: c.efforts.tendon_scale(field, values, lengths) for field, values in losses.items()}
     for t, image in c.action.tendons.items():
         u, sign, name = image.index, image.sign, c.name("tendon", t, image.index)
         fixed = model.wrap_type[int(model.tendon_adr[t])] == int(mj.mjtWrap.mjWRAP_JOINT)
@@ -48,9 +52,8 @@ def compare_tendons(c: Comparison) -> None:
         if model.tendon_stiffness[t] > 0 and not image.mixture:
             c.range("tendon spring", "tendon_lengthspring", None, t, u, sign, shift, name)
         for term, field in _LOSSES.items():
-            values = np.array(getattr(model, f"tendon_{field}"))
-            scale = c.efforts.tendon_scale(field, values, lengths)[[t, u]].min()
-            c.add(term, float(abs(values[t] - values[u]) / scale), name)
+            apart = abs(losses[field][t] - losses[field][u])
+            c.add(term, float(apart / scales[field][[t, u]].min()), name)
         for term, fields in (
             ("tendon spring", ["stiffnesspoly"]),
             ("tendon damping", ["dampingpoly"]),

@@ -34,7 +34,7 @@ def map_actuators(
     model = matcher.model
     drives = Transmissions(matcher, map_, tendons, tolerance)
     count = getattr(model, "nactuator", model.nu)
-    if np.array_equal(matcher.matrix, np.eye(3)):
+    if matcher.is_identity:
         return {a: Image(a) for a in range(count)}, {}
     refusals = {a: reason for a in range(count) if (reason := drives.unsupported(a))}
     known = [a for a in range(count) if a not in refusals]

@@ -15,6 +15,8 @@ which is a signed permutation if axes go to axes, and mixes the slides of a plan
 
 from __future__ import annotations
 
+import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,10 +52,9 @@ def pair_joints(
     parts: Parts, matrix: Array, mine: Sequence[int], theirs: Sequence[int], cost: Array
 ) -> JointPairs:
     """Images of joints ``mine`` of a body among those of its image, ``theirs``, by the cost of pairs."""
-    ranks = np.abs(np.subtract.outer(np.arange(len(mine)), np.arange(len(theirs))))
-    rows, columns = linear_sum_assignment(cost + _RANK * ranks)
-    images = {mine[r]: theirs[c] for r, c in zip(rows, columns, strict=True)}
-    costs = {mine[r]: float(cost[r, c]) for r, c in zip(rows, columns, strict=True)}
+    columns = linear_sum_assignment(cost + _places(len(mine)))[1].tolist()
+    images = {i: theirs[c] for i, c in zip(mine, columns, strict=True)}
+    costs = {i: float(cost[r, c]) for r, (i, c) in enumerate(zip(mine, columns, strict=True))}
 
     weights = {(i, j): 1.0 for i, j in images.items()}
     slides, others = (_slides(parts, joints) for joints in (mine, theirs))
@@ -69,11 +70,18 @@ def pair_joints(
             weights |= {
                 (i, j): float(mixing[y, x]) for x, i in enumerate(slides) for y, j in enumerate(others)
             }
-    return JointPairs(images, costs, _order_gap(parts, mine, theirs, weights), mixes)
+    in_order = not mixes and columns == sorted(columns)
+    return JointPairs(images, costs, 0.0 if in_order else _order_gap(parts, mine, theirs, weights), mixes)
+
+
+@functools.cache  # bodies have a few joints
+def _places(count: int) -> Array:
+    """What it costs to go to another place in the order."""
+    return _RANK * np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
 
 
 def _slides(parts: Parts, joints: Sequence[int]) -> list[int]:
-    return [j for j in joints if int(parts.model.jnt_type[j]) == SLIDE]
+    return [j for j in joints if parts.skeleton.kinds[j] == SLIDE]
 
 
 def _square(parts: Parts, slides: list[int]) -> bool:
@@ -102,17 +110,18 @@ def _order_gap(
 
 def _commutator(parts: Parts, i: int, j: int) -> float:
     """How far two joints of one body are from commuting: 0 to 1."""
-    kinds = {int(parts.model.jnt_type[k]) for k in (i, j)}
+    kinds = {parts.skeleton.kinds[i], parts.skeleton.kinds[j]}
     if kinds == {SLIDE}:
         return 0.0
     if BALL in kinds:
         return 1.0
-    axis = parts.axes[i]
-    turn = float(np.linalg.norm(np.cross(axis, parts.axes[j])))
+    (x, y, z), (u, v, w) = parts.axes[[i, j]].tolist()
+    turn = math.hypot(y * w - z * v, z * u - x * w, x * v - y * u)
     if kinds == {HINGE}:
-        gap = parts.anchors[j] - parts.anchors[i]
-        gap = gap - (gap @ axis) * axis
-        turn = max(turn, float(np.linalg.norm(gap)) / parts.size(int(parts.model.jnt_bodyid[i])))
+        a, b, c = (parts.anchors[j] - parts.anchors[i]).tolist()
+        along = a * x + b * y + c * z
+        gap = math.hypot(a - along * x, b - along * y, c - along * z)
+        turn = max(turn, gap / parts.size(int(parts.model.jnt_bodyid[i])))
     return min(turn, 1.0)
 
 

@@ -91,7 +91,7 @@ def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
     tried: list[tuple[float, str, Array, Array]] = []
 
     def attempt(by: Turning, words: str, turn: Array, point: Array) -> bool:
-        if not any(np.allclose(turn, t[2], atol=1e-12) and point is t[3] for t in tried):
+        if not any(point is t[3] and _close(turn, t[2]) for t in tried):
             tried.append((by.misfit(tree, tree, (turn, turn), elements), words, turn, point))
         return tried[-1][0] <= _GOOD
 
@@ -114,6 +114,10 @@ def _own(turning: Turning, tree: int) -> tuple[float, str, Array, Array]:
     if not np.isfinite(best[0]):
         return tried[0]
     return next(t for t in tried if _BETTER * t[0] <= best[0])
+
+
+def _close(one: Array, other: Array) -> bool:
+    return bool((np.abs(one - other) <= 1e-12 + 1e-5 * np.abs(other)).all())
 
 
 def _misfit(tried: tuple[float, str, Array, Array]) -> float:
@@ -177,7 +181,7 @@ def _buckets(turning: Turning) -> list[list[int]]:
     for b in parts.loose:
         links = [parts.links[x] for x in parts.tree(b)]
         kinds = tuple(sorted(int(model.jnt_type[j]) for link in links for j in link.joints))
-        moments = np.linalg.eigvalsh(links[0].inertia)
+        moments = np.linalg.eigvalsh(parts.inertias[b])
         numbers = np.array([sum(link.mass for link in links), _reach(parts, b), *moments])
         key = (len(links), kinds, bool(model.body_mocapid[b] >= 0))
         for other, near, members in found:

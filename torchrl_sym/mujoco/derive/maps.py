@@ -43,6 +43,9 @@ def represent(group: PointGroup, matrices: Sequence[Array]) -> Representation:
         empty = torch.zeros(group.order, 0)
         return Representation.from_blocks(group, [SignedPermutation(empty, empty)], check=False)
     whole = np.stack(matrices)
+    block = block_from_matrices(torch.as_tensor(whole))
+    if isinstance(block, SignedPermutation):
+        return Representation.from_blocks(group, [block])
     used = (whole != 0).any(axis=0)
     used |= used.T
     # cut wherever no entry reaches across, so that joints beside a turned cube are still permuted

@@ -11,6 +11,7 @@ import numpy as np
 from torchrl_sym.mujoco.derive.chains import JointPairs
 from torchrl_sym.mujoco.derive.pairing import Misfit, Pairing
 from torchrl_sym.mujoco.derive.parts import Parts
+from torchrl_sym.mujoco.model.links import is_loose
 from torchrl_sym.mujoco.model.poses import shift
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import Array, MjData, mj
@@ -30,7 +31,7 @@ class Matcher:
         data: kinematics at the reference pose, places relative to the axis.
         extent: size of the largest tree of moving links, which lengths are made relative to.
         image: kinematics where images are looked for: the reference pose, carried bodies turned by R.
-        links: from :func:`~torchrl_sym.mujoco.model.links.links_of`.
+        skeleton, links: how the model's links hang together.
         carried: bodies that are only carried along, so that their frames turn with the world.
         shift: (I - R) axis, what R adds to a point of the world.
         images: image of every link, as a map of body numbers.
@@ -39,19 +40,19 @@ class Matcher:
     def __init__(
         self, parts: Parts, matrix: Array, lift: Array, axis: Array, loose: dict[int, int]
     ) -> None:
-        self.model, self.data, self.links, self.carried = (
-            parts.model,
-            parts.data,
-            parts.links,
-            parts.carried,
-        )
+        self.model, self.data, self.carried = parts.model, parts.data, parts.carried
+        self.skeleton, self.links = parts.skeleton, parts.links
         self.matrix, self.lift, self.axis = matrix, lift, axis
         self.det = round(float(np.linalg.det(matrix)))
         self.shift = axis - matrix @ axis
         self.extent = parts.extent
         self.image = self._carry() if self.carried else self.data
         self.pairing = Pairing(parts, matrix)
-        self.images = self.pairing.images(0, 0, loose | {b: b for b in self.carried})
+        self.is_identity = np.array_equal(matrix, np.eye(3))
+        if self.is_identity:
+            self.images = {b: b for b in self.links}
+        else:
+            self.images = self.pairing.images(0, 0, loose | {b: b for b in self.carried})
 
     def _carry(self) -> MjData:
         model, data, image = self.model, self.data, mj.MjData(self.model)
@@ -77,10 +78,18 @@ class Matcher:
 
     def misfit(self, tolerance: float) -> Misfit:
         """The worst pair of links or joints; above 1 this is no symmetry."""
+        if self.is_identity:
+            return Misfit(0.0)
         missing = [b for b in self.links[0].children if b not in self.images]
         if missing:
             return Misfit(np.inf, "missing", missing[0])
         return self.pairing.worst(self.images, tolerance)
+
+    def ambiguous(self) -> list[tuple[int, int]]:
+        """Pairs of links that nothing tells apart."""
+        if self.is_identity:  # of which nothing else asks how alike links are
+            self.pairing.images(0, 0, {b: b for b in self.links[0].children if is_loose(self.model, b)})
+        return self.pairing.ambiguous(self.images)
 
     def joints(self) -> dict[int, int]:
         """Image of every joint, if every link has one."""

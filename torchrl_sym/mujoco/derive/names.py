@@ -6,6 +6,7 @@ cubes, the names that people give their parts do.
 
 from __future__ import annotations
 
+import functools
 import re
 
 import numpy as np
@@ -29,23 +30,24 @@ def exchanged(matrix: Array) -> tuple[bool, bool]:
     return half, half
 
 
-def counterparts(name: str, sides: bool, ends: bool) -> list[str]:
+@functools.lru_cache(maxsize=1 << 14)  # asked for the same parts at every pose
+def counterparts(name: str, sides: bool, ends: bool) -> tuple[str, ...]:
     """Names that the image of a part called so may have; empty if the name says nothing.
 
     Example:
         >>> counterparts("left_hip", sides=True, ends=False)
-        ['right_hip']
+        ('right_hip',)
         >>> counterparts("LF_KFE", sides=True, ends=False)
-        ['RF_KFE']
+        ('RF_KFE',)
         >>> counterparts("torso", sides=True, ends=True)
-        []
+        ()
     """
-    found = []
+    found: list[str] = []
     for end in dict.fromkeys(other for pair in _ENDS for other in pair[1:] if len(other) > 1):
         image = _WORD.sub(lambda match, end=end: _cased(match[0], sides, ends, end), name)
         if image != name and image not in found:
             found.append(image)
-    return found
+    return tuple(found)
 
 
 def _cased(word: str, sides: bool, ends: bool, end: str) -> str:

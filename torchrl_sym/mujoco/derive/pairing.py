@@ -11,22 +11,23 @@ closed gripper, names and ranges decide, and then that parts stay where they are
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from torchrl_sym.mujoco.derive.chains import JointPairs, pair_joints
-from torchrl_sym.mujoco.derive.names import counterparts, exchanged
+from torchrl_sym.mujoco.derive.gaps import Gaps, Pairs, columns
+from torchrl_sym.mujoco.derive.hints import Hints, exchanges
 from torchrl_sym.mujoco.derive.parts import Parts
-from torchrl_sym.mujoco.model.links import is_loose
-from torchrl_sym.mujoco.model.types import BALL, FREE, HINGE, SLIDE, Array, label_of, name_of
+from torchrl_sym.mujoco.model.types import Array
 
 _MISFIT = 1e3  # cost of a pair that cannot be the image of each other; far above any distance
 _STAY = 1e-9  # links at one place stay where they are
 _UNDECIDED = 2e-2  # assignments whose costs differ by less are told apart by names and ranges
-_NAME, _RANGE = 3e-2, 2e-2  # what a name or a range that disagrees costs then
 _ORDER = 0.1  # joints that act in another order: less than a link on the wrong side
 _NEAREST = 8  # of many siblings, only so many near ones are compared in full
 # A link's centre of mass may miss its image's by so many tolerances (10 % of its tree, by default): enough
@@ -44,6 +45,35 @@ class Misfit:
     other: int = 0
 
 
+@dataclass(slots=True)
+class _Siblings:
+    """Two sets of siblings, one of which is to be mapped into the other.
+
+    Attributes:
+        mine, theirs: the links.
+        compared: for each of mine, the places in theirs that it is compared with in full; None for all.
+        costs: of pairs that are not, ``(len(mine), len(theirs))``.
+        cost, pairs: of the best assignment, once it is known.
+    """
+
+    mine: Sequence[int]
+    theirs: Sequence[int]
+    compared: NDArray[np.intp] | None = None
+    costs: Array | None = None
+    cost: float = 0.0
+    pairs: list[tuple[int, int]] = field(default_factory=list)
+
+    def candidates(self) -> Pairs:
+        """Pairs that are compared in full."""
+        if self.compared is None:
+            return [(a, b) for a in self.mine for b in self.theirs]
+        rows = zip(self.mine, self.compared.tolist(), strict=True)
+        return [(a, self.theirs[k]) for a, places in rows for k in places]
+
+
+_NONE = _Siblings([], [])  # of links without children, of which most pairs are
+
+
 class Pairing:
     """Finds images under one isometry.
 
@@ -57,16 +87,13 @@ class Pairing:
     def __init__(self, parts: Parts, matrix: Array, acting: Array | None = None) -> None:
         self.parts, self.model, self.links = parts, parts.model, parts.links
         self.matrix, self.acting = matrix, matrix if acting is None else acting
-        self.det = round(float(np.linalg.det(matrix)))
-        masses = [link.mass for body, link in self.links.items() if body]
-        self.total_mass = max(sum(masses), 1e-12)
-        inertias = [float(np.trace(link.inertia)) for body, link in self.links.items() if body]
-        self.total_inertia = max([*inertias, 1e-12])
+        self.gaps = Gaps(parts, matrix)
         self.undecided: dict[tuple[int, int], tuple[int, int]] = {}
-        self._names: tuple[bool, bool] | None = None
-        self._costs: dict[tuple[int, int], float] = {}
-        self._known: dict[str, dict[str, int]] = {}
-        self._pairs: dict[tuple[int, int], tuple[float, list[tuple[int, int]]]] = {}
+        self._hints: Hints | None = None
+        self._compared: list[tuple[int, int]] = []  # pairs of links, each after its parents
+        self._own: dict[tuple[int, int], float] = {}  # costs of pairs of links without what is below
+        self._below: dict[tuple[int, int], _Siblings] = {}
+        self._costs: dict[tuple[int, int], float] = {}  # of pairs of joints
         self._joints: dict[tuple[int, int], JointPairs] = {}
 
     def images(
@@ -80,27 +107,139 @@ class Pairing:
             known: images of trees that are known already.
             only: trees to look at; all by default.
         """
-        trees = (known or {}), self.links[0].children if only is None else only
-        images = self._descend(a, b, *trees)
-        if not self._ties(images):
-            return images
-        # once more, with names and ranges where geometry is undecided
-        self._names = self._exchanged(images)
-        self._pairs.clear()
-        return self._descend(a, b, *trees)
+        known = known or {}
+        if a == 0:
+            trees, taken = self.links[0].children if only is None else only, set(known.values())
+            mine, theirs = [c for c in trees if c not in known], [c for c in trees if c not in taken]
+            self._below[0, 0] = self._siblings(mine, theirs)
+        top = [(a, b), *known.items()]
+        self._compare(top)
+        images = self._descend(top)
+        if self._ties(images):
+            # once more, with names and ranges where geometry is undecided
+            doubtful = {pair[0] for pair in self._ties(images)}
+            flags = exchanges(self.parts.skeleton, images, doubtful, self.acting)
+            self._hints = Hints(self.gaps, flags)
+            self._add_hints(self._compared)
+            self._assign(self._compared)
+            images = self._descend(top)
+        return images
 
-    def _descend(self, a: int, b: int, known: dict[int, int], trees: Sequence[int]) -> dict[int, int]:
-        images, stack = {}, [(a, b)]
+    def _descend(self, top: Pairs) -> dict[int, int]:
+        images, stack = {}, [*top]
         while stack:
             a, b = stack.pop()
             images[a] = b
-            if a == 0:
-                mine = [c for c in trees if c not in known]
-                theirs = [c for c in trees if c not in known.values()]
-                stack += [*known.items(), *self.assign(mine, theirs)[1]]
-            else:
-                stack += self._pair(a, b)[1]
+            if (a, b) not in self._below:  # they were too far apart to be compared
+                self._compare([(a, b)])
+            stack += self._below[a, b].pairs
         return dict(sorted(images.items()))
+
+    def _compare(self, pairs: Pairs) -> None:
+        """Find costs of pairs of links, and the best pairs of what hangs on them."""
+        found = [*pairs]
+        for a, b in found:
+            if (a, b) not in self._below:
+                carried = not self.parts.carried.isdisjoint((a, b))
+                children = [] if carried else self.links[a].children
+                self._below[a, b] = self._siblings(children, [] if carried else self.links[b].children)
+            found += self._below[a, b].candidates()  # to which this loop comes as well
+        new = [pair for pair in found if pair not in self._own]
+        self._measure(new)
+        if self._hints is not None:
+            self._add_hints(new)
+        self._compared += new
+        self._assign(found)
+
+    def _siblings(self, mine: Sequence[int], theirs: Sequence[int]) -> _Siblings:
+        if not mine and not theirs:
+            return _NONE
+        if not mine or len(theirs) <= _NEAREST:
+            return _Siblings(mine, theirs)
+        ends = self.gaps.centers[list(mine)], self.parts.centers[list(theirs)]
+        apart = np.linalg.norm(ends[0][:, None] - ends[1], axis=-1)
+        near = np.argsort(apart, axis=1, kind="stable")[:, :_NEAREST]
+        return _Siblings(mine, theirs, near, _MISFIT * (1 + apart / self.parts.extent))
+
+    def _measure(self, pairs: Pairs) -> None:
+        """Find costs of pairs of links, those of links below left out."""
+        self.measure_joints(pairs)
+        one, other = columns(pairs)
+        counts, mocap = self.model.body_jntnum, self.model.body_mocapid >= 0
+        costs = self.gaps.of_links(pairs) + _STAY * (one != other)
+        costs += _MISFIT * (mocap[one] != mocap[other]) + _MISFIT * (counts[one] != counts[other])
+        joints = [self._cost_of_joints(a, b) for a, b in pairs]
+        self._own.update(zip(pairs, (costs + joints).tolist(), strict=True))
+        for a, b in pairs if self.parts.carried else ():
+            if a in self.parts.carried or b in self.parts.carried:
+                self._own[a, b] = 0.0 if a == b else _MISFIT
+
+    def measure_joints(self, pairs: Pairs) -> None:
+        """Compare the joints of many pairs of links at once, for what is asked about them later."""
+        links = self.links
+        joints = [
+            (i, j)
+            for a, b in pairs
+            if len(links[a].joints) == len(links[b].joints)
+            for i in links[a].joints
+            for j in links[b].joints
+        ]
+        self._costs.update(zip(joints, self.gaps.joint_costs(joints, _MISFIT).tolist(), strict=True))
+
+    def _cost_of_joints(self, a: int, b: int) -> float:
+        mine, theirs = self.links[a].joints, self.links[b].joints
+        if len(mine) == len(theirs) == 1:
+            return self._costs[mine[0], theirs[0]]
+        joints = self.joint_pairs(a, b)
+        return sum(joints.costs.values()) + _ORDER * joints.order
+
+    def _add_hints(self, pairs: Pairs) -> None:
+        """Add what names and ranges say to the costs of pairs of links."""
+        assert self._hints is not None
+        free = [(a, b) for a, b in pairs if a not in self.parts.carried and b not in self.parts.carried]
+        costs = self._hints.costs(free, [self.joints_to(a, b) for a, b in free])
+        for pair, cost in zip(free, costs, strict=True):
+            self._own[pair] += cost
+
+    def _assign(self, pairs: Pairs) -> None:
+        """Find the best pairs of the children of pairs of links, each of which comes after its parents."""
+        for pair in reversed(pairs):
+            below = self._below[pair]
+            if below is _NONE:
+                continue
+            mine, theirs = below.mine, below.theirs
+            rest = _MISFIT * abs(len(mine) - len(theirs))
+            if not mine or not theirs:
+                below.cost = rest
+            elif len(mine) == len(theirs) == 1:
+                below.pairs = [(mine[0], theirs[0])]
+                below.cost = self._cost(*below.pairs[0])
+            else:
+                table = self._table(below)
+                best = linear_sum_assignment(table)
+                below.pairs = [(mine[r], theirs[c]) for r, c in zip(*best, strict=True)]
+                below.cost = float(table[best].sum()) + rest
+                self._find_undecided(table[np.ix_(*best)], below.pairs)
+
+    def _cost(self, a: int, b: int) -> float:
+        """Cost of mapping the subtree of a onto that of b."""
+        return self._own[a, b] + self._below[a, b].cost
+
+    def _table(self, below: _Siblings) -> Array:
+        if below.costs is None or below.compared is None:
+            return np.array([[self._cost(a, b) for b in below.theirs] for a in below.mine])
+        table = below.costs.copy()
+        costs = [self._cost(a, b) for a, b in below.candidates()]
+        np.put_along_axis(table, below.compared, np.reshape(costs, below.compared.shape), axis=1)
+        return table
+
+    def _find_undecided(self, costs: Array, pairs: Pairs) -> None:
+        """Remember pairs that could as well be exchanged with others, by costs of the ends of all pairs."""
+        least = costs.diagonal()
+        swap = costs + costs.T - (least[:, None] + least)
+        for r, c in zip(*(axis.tolist() for axis in np.nonzero(swap < _UNDECIDED)), strict=True):
+            if r < c:
+                self.undecided[pairs[r]], self.undecided[pairs[c]] = pairs[c], pairs[r]
 
     def joints_to(self, a: int, b: int) -> dict[int, int]:
         """Image among the joints of link b of every joint of link a; empty if their numbers differ."""
@@ -124,59 +263,31 @@ class Pairing:
     def joint_cost(self, i: int, j: int) -> float:
         """How far joint i's image is from joint j: type, axis up to sign, and anchor."""
         if (i, j) not in self._costs:
-            turn, away = self.joint_gaps(i, j)
-            size = self.parts.size(int(self.model.jnt_bodyid[j]))
-            self._costs[i, j] = 1 - float(np.cos(turn)) + away / size if np.isfinite(turn) else _MISFIT
+            self.measure_joints([tuple(self.parts.skeleton.joint_links[[i, j]].tolist())])
         return self._costs[i, j]
-
-    def joint_gaps(self, i: int, j: int) -> tuple[float, float]:
-        """Angle (rad) between the axes and distance (m) between the anchors; infinite for other types."""
-        kind = int(self.model.jnt_type[i])
-        if kind != int(self.model.jnt_type[j]):
-            return np.inf, np.inf
-        if kind == FREE:
-            return 0.0, 0.0
-        offset = self.matrix @ self.parts.anchors[i] - self.parts.anchors[j]
-        if kind == BALL:
-            return 0.0, float(np.sqrt(offset @ offset))
-        axis = self.parts.axes[j]
-        image = self.matrix @ self.parts.axes[i]
-        x, y, z = image
-        u, v, w = axis
-        sine = np.sqrt((y * w - z * v) ** 2 + (z * u - x * w) ** 2 + (x * v - y * u) ** 2)
-        turn = float(np.arctan2(sine, abs(image @ axis)))
-        if kind == SLIDE:
-            return turn, 0.0  # a slide's anchor does not matter
-        offset = offset - (offset @ axis) * axis  # a hinge's anchor may be anywhere on its axis
-        return turn, float(np.sqrt(offset @ offset))
 
     def holds(self, a: int, b: int, tolerance: float) -> bool:
         """Whether b is where a should be, and joints on a have images on b: no pose decides that."""
-        if self.center_gap(a, b) > _CENTER * tolerance * self.parts.size(b):
+        if self.gaps.of_centers([(a, b)])[0] > _CENTER * tolerance * self.parts.size(b):
             return False
         mine, theirs = ([j for c in self.links[x].children for j in self.links[c].joints] for x in (a, b))
-        return all(any(self.joint_cost(i, j) <= tolerance for j in theirs) for i in mine)
-
-    def center_gap(self, a: int, b: int) -> float:
-        """Distance (m) of the centre of mass of link a's image from that of b; 0 if one has no mass."""
-        if min(self.links[a].mass, self.links[b].mass) <= 0:
-            return 0.0
-        return float(np.linalg.norm(self.matrix @ self.parts.centers[a] - self.parts.centers[b]))
+        costs = self.gaps.joint_costs([(i, j) for i in mine for j in theirs], _MISFIT)
+        return bool((costs.reshape(len(mine), len(theirs)) <= tolerance).any(axis=1).all())
 
     def worst(self, images: dict[int, int], tolerance: float) -> Misfit:
         """The worst of a matching's pairs of joints and links; above 1 it is no matching."""
         found = Misfit(0.0)
-        for a, b in images.items():
-            if a == 0 or a in self.parts.carried:
-                continue
+        pairs = [(a, b) for a, b in images.items() if a and a not in self.parts.carried]
+        self.measure_joints([pair for pair in pairs if pair not in self._own])
+        gaps = self.gaps.of_centers(pairs) / self.parts.link_sizes[columns(pairs)[1]] / _CENTER
+        for (a, b), gap in zip(pairs, gaps.tolist(), strict=True):
             link = self.links[a]
             joints = self.joint_pairs(a, b)
             short = len(link.joints) != len(self.links[b].joints) or any(
                 c not in images for c in link.children
             )
-            if short or self._is_mocap(a) != self._is_mocap(b):
+            if short or (self.model.body_mocapid[a] >= 0) != (self.model.body_mocapid[b] >= 0):
                 return Misfit(np.inf, "missing", a, b)
-            gap = self.center_gap(a, b) / self.parts.size(b) / _CENTER
             if gap > found.size * tolerance:
                 found = Misfit(gap / max(tolerance, 1e-12), "link", a, b)
             if joints.order > found.size * tolerance:
@@ -186,59 +297,6 @@ class Pairing:
                 if cost > found.size * tolerance:
                     found = Misfit(cost / max(tolerance, 1e-12), "joint", i, j)
         return found
-
-    def assign(self, mine: Sequence[int], theirs: Sequence[int]) -> tuple[float, list[tuple[int, int]]]:
-        """Best pairs of links out of two sets of siblings, and their cost."""
-        if not mine or not theirs:
-            return _MISFIT * abs(len(mine) - len(theirs)), []
-        if len(mine) == len(theirs) == 1:
-            return self._pair(mine[0], theirs[0])[0], [(mine[0], theirs[0])]
-        table = self._table(mine, theirs)
-        rows, columns = linear_sum_assignment(table)
-        pairs = [(mine[r], theirs[c]) for r, c in zip(rows, columns, strict=True)]
-        swap = table[np.ix_(rows, columns)]
-        swap = swap + swap.T - np.add.outer(swap.diagonal(), swap.diagonal())
-        for r, c in np.argwhere(np.triu(swap < _UNDECIDED, 1)):
-            self.undecided[pairs[r]], self.undecided[pairs[c]] = pairs[c], pairs[r]
-        cost = float(table[rows, columns].sum()) + _MISFIT * abs(len(mine) - len(theirs))
-        return cost, pairs
-
-    def _table(self, mine: Sequence[int], theirs: Sequence[int]) -> Array:
-        if len(theirs) <= _NEAREST:
-            return np.array([[self._pair(c, d)[0] for d in theirs] for c in mine])
-        ends = self.parts.centers[list(mine)] @ self.matrix.T, self.parts.centers[list(theirs)]
-        apart = np.linalg.norm(ends[0][:, None] - ends[1], axis=-1)
-        table = _MISFIT * (1 + apart / self.parts.extent)
-        for row, c in enumerate(mine):
-            for column in np.argsort(apart[row], kind="stable")[:_NEAREST]:
-                table[row, column] = self._pair(c, theirs[column])[0]
-        return table
-
-    def _pair(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
-        if (a, b) not in self._pairs:  # not functools.cache, which does not pickle
-            self._pairs[a, b] = self._pair_of_links(a, b)
-        return self._pairs[a, b]
-
-    def _pair_of_links(self, a: int, b: int) -> tuple[float, list[tuple[int, int]]]:
-        """Cost of mapping subtree a onto subtree b, and the best pairs of children."""
-        if a in self.parts.carried or b in self.parts.carried:
-            return (0.0 if a == b else _MISFIT), []
-        one, other = self.links[a], self.links[b]
-        cost = self.center_gap(a, b) / self.parts.size(b) + abs(one.mass - other.mass) / self.total_mass
-        image = self.matrix @ one.inertia @ self.matrix.T
-        cost += float(np.abs(image - other.inertia).max()) / self.total_inertia
-        cost += _STAY * (a != b)
-        cost += _MISFIT * (self._is_mocap(a) != self._is_mocap(b))
-        joints = self.joint_pairs(a, b)
-        cost += _MISFIT * (len(one.joints) != len(other.joints))
-        cost += sum(joints.costs.values()) + _ORDER * joints.order
-        if self._names is not None:
-            cost += self._hint(a, b, joints.images)
-        below, pairs = self.assign(one.children, other.children)
-        return cost + below, pairs
-
-    def _is_mocap(self, body: int) -> bool:
-        return bool(self.model.body_mocapid[body] >= 0)
 
     def _ties(self, images: dict[int, int]) -> list[tuple[int, int]]:
         """Pairs of the matching that could as well be exchanged with others."""
@@ -254,106 +312,9 @@ class Pairing:
         for a, b in self._ties(images):
             c, d = self.undecided[a, b]
             if a < c and images.get(c) == d:
-                now, swapped = (
-                    sum(self._pair(*pair)[0] for pair in p) for p in (((a, b), (c, d)), ((a, d), (c, b)))
-                )
+                both = ((a, b), (c, d)), ((a, d), (c, b))
+                self._compare([pair for pair in itertools.chain(*both) if pair not in self._own])
+                now, swapped = (sum(self._cost(*pair) for pair in pairs) for pairs in both)
                 if abs(now - swapped) < 1e-6:
                     found.append((a, c))
         return found
-
-    def _exchanged(self, images: dict[int, int]) -> tuple[bool, bool]:
-        """Whether left and right, front and hind change places, by the names of what is beyond doubt."""
-        default = exchanged(self.acting)
-        ties = {pair[0] for pair in self._ties(images)}
-        votes = {flags: 0 for flags in ((False, False), (True, False), (False, True), (True, True))}
-        for a, b in images.items():
-            if a and a not in ties and a != b:
-                name, image = (name_of(self.model, "body", x) for x in (a, b))
-                for flags in votes:
-                    votes[flags] += image in counterparts(name, *flags)
-        best = max(votes, key=lambda flags: (votes[flags], flags == default))
-        return best if votes[best] > votes[default] else default
-
-    def _hint(self, a: int, b: int, joints: dict[int, int]) -> float:
-        """What speaks against a pair beside geometry: names that have another counterpart, and ranges."""
-        assert self._names is not None
-        cost = _NAME * self._named_otherwise("body", a, b)
-        for i, j in joints.items():
-            cost += _NAME * self._named_otherwise("joint", i, j) + _RANGE * self.range_gap(i, j)
-        return cost
-
-    def _named_otherwise(self, kind: str, a: int, b: int) -> bool:
-        assert self._names is not None
-        known = self._numbers(kind)
-        other = [known[n] for n in counterparts(name_of(self.model, kind, a), *self._names) if n in known]
-        return bool(other) and b not in other
-
-    def _numbers(self, kind: str) -> dict[str, int]:
-        if kind not in self._known:
-            count = {"body": self.model.nbody, "joint": self.model.njnt}[kind]
-            self._known[kind] = {name_of(self.model, kind, index): index for index in range(count)}
-        return self._known[kind]
-
-    def range_gap(self, i: int, j: int) -> float:
-        """How far the image of joint i's range is from that of joint j, at most 1."""
-        model, kind = self.model, int(self.model.jnt_type[i])
-        if kind not in (HINGE, SLIDE) or int(model.jnt_type[j]) != kind:
-            return 0.0
-        if not (model.jnt_limited[i] and model.jnt_limited[j]):
-            return float(model.jnt_limited[i] != model.jnt_limited[j])
-        qpos, address = self.parts.data.qpos, model.jnt_qposadr
-        sign = self.sign(i, j)
-        shift = qpos[address[j]] - sign * qpos[address[i]]
-        one, other = np.sort(sign * model.jnt_range[i] + shift), model.jnt_range[j]
-        return min(1.0, float(np.abs(one - other).max()) / max(float(np.ptp(other)), 1e-9))
-
-    def sign(self, i: int, j: int) -> float:
-        """Sign between the coordinates of two hinges or slides that are images of each other."""
-        handed = self.det if int(self.model.jnt_type[i]) == HINGE else 1
-        return 1.0 if handed * float(self.matrix @ self.parts.axes[i] @ self.parts.axes[j]) > 0 else -1.0
-
-    def explain(self, misfit: Misfit, element: str, tolerance: float) -> str:
-        """What has no image and how far the nearest is, in degrees and millimetres."""
-        model, a, b = self.model, misfit.one, misfit.other
-        if misfit.kind == "missing":
-            return (
-                f"{label_of(model, 'body', a)} has no image under {element!r}: no body with as many joints "
-                "and children is left on the other side"
-            )
-        limit = f"tolerance {tolerance:g}"
-        if misfit.kind == "link":
-            gap, size = self.center_gap(a, b), self.parts.size(b)
-            name = name_of(model, "body", a)
-            return (
-                f"{label_of(model, 'body', a)} has no image under {element!r}: the nearest, "
-                f"{label_of(model, 'body', b)}, has its centre of mass {1e3 * gap:.1f} mm beside it "
-                f"({100 * gap / size:.0f} % of the size of what moves; {limit})"
-                + f"; if it may have any shape, pass carried=[{name!r}]"
-                * self._can_be_carried(a)
-            )
-        if misfit.kind == "order":
-            return self._explain_order(a, b, element)
-        turn, away = self.joint_gaps(a, b)
-        if not np.isfinite(turn):
-            what = label_of(model, "joint", a)
-            return f"{what} has no image under {element!r}: no joint of its type is there"
-        return (
-            f"{label_of(model, 'joint', a)} has no image under {element!r}: the nearest, "
-            f"{label_of(model, 'joint', b)}, misses it by {np.degrees(turn):.2g} degrees and "
-            f"{1e3 * away:.3g} mm ({limit})"
-        )
-
-    def _explain_order(self, a: int, b: int, element: str) -> str:
-        def listed(joints: Sequence[int]) -> str:
-            return ", ".join(label_of(self.model, "joint", j) for j in joints)
-
-        images = self.joints_to(a, b)
-        return (
-            f"{label_of(self.model, 'body', a)} has no image under {element!r}: its joints, "
-            f"{listed(self.links[a].joints)}, go to {listed(list(images.values()))} in this order, but "
-            f"{label_of(self.model, 'body', b)} has them in the order {listed(self.links[b].joints)}, "
-            "and they do not commute; list the joints of both bodies in the same order, or use a ball joint"
-        )
-
-    def _can_be_carried(self, body: int) -> bool:
-        return is_loose(self.model, body) and not self.links[body].children

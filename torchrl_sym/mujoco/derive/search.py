@@ -15,11 +15,15 @@ import numpy as np
 
 from torchrl_sym.groups import PointGroup
 from torchrl_sym.mujoco.derive.axis import find_axis
+from torchrl_sym.mujoco.derive.explanation import explain
+from torchrl_sym.mujoco.derive.gaps import columns
+from torchrl_sym.mujoco.derive.hints import range_gaps
 from torchrl_sym.mujoco.derive.images import SymmetryError
 from torchrl_sym.mujoco.derive.loose import Standing, generators, stand
 from torchrl_sym.mujoco.derive.matching import Matcher
 from torchrl_sym.mujoco.derive.parts import Parts
 from torchrl_sym.mujoco.derive.solving import solved
+from torchrl_sym.mujoco.model.links import Numbers, Skeleton
 from torchrl_sym.mujoco.model.poses import Pose, kinematics, poses, shift
 from torchrl_sym.mujoco.model.rotations import quaternion
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjModel, label_of
@@ -48,7 +52,7 @@ class Stance:
     @property
     def ambiguous(self) -> list[str]:
         """Sentences on parts that nothing tells apart."""
-        pairs = {pair for m in self.matchers for pair in m.pairing.ambiguous(m.images)}
+        pairs = {pair for matcher in self.matchers for pair in matcher.ambiguous()}
         model = self.matchers[0].model
         names = [[label_of(model, "body", b) for b in pair] for pair in sorted(pairs)]
         return [*self.standing.ambiguous, *(f"{a} and {b} are alike and in one place" for a, b in names)]
@@ -78,6 +82,7 @@ class Search:
         self.model, self.group, self.lifts, self.tolerance = model, group, lifts, tolerance
         self.carried, self.axis = carried, axis
         self.matrices = group.matrices.numpy()
+        self.skeleton = Skeleton(model)
 
     def find(self, keyframe: int | str | None) -> Stance:
         """The first stance that fits.
@@ -95,7 +100,7 @@ class Search:
                 break
         if keyframe is None and not tried[-1].standing.hopeless:
             start = tried[0]
-            pose = solved(self.model, self.group, start.pose, start.axis, self.carried, self.tolerance)
+            pose = solved(self.skeleton, self.group, start.pose, start.axis, self.carried, self.tolerance)
             if pose is not None and self._in_range(stance := self._at(pose)):
                 tried.append(stance)
         best = min(tried, key=lambda stance: stance.misfit)
@@ -105,7 +110,7 @@ class Search:
         return self._settled(best if best.misfit <= _CLEARLY * first.misfit else first)
 
     def _at(self, pose: Pose) -> Stance:
-        model, parts = self.model, Parts.of(self.model, kinematics(self.model, pose), self.carried)
+        model, parts = self.model, Parts.of(self.skeleton, kinematics(self.model, pose), self.carried)
         if self.axis is None:
             axis = find_axis(parts, self.matrices[generators(self.group)], self.tolerance)[0]
         else:
@@ -115,7 +120,7 @@ class Search:
         shift(data, -axis)
         # the points of loose trees that are on the axis now, as high as their images
         points = {b: data.xpos[b] + standing.turns[b] @ standing.points[b] for b in standing.turns}
-        parts = Parts.of(model, data, self.carried).about(points)
+        parts = Parts.of(self.skeleton, data, self.carried).about(points)
         matchers = [
             Matcher(parts, matrix, lift, axis, images)
             for matrix, lift, images in zip(self.matrices, self.lifts, standing.images, strict=True)
@@ -146,9 +151,8 @@ class Search:
     def _in_range(self, stance: Stance) -> bool:
         """Whether a pose that was solved for fits, and sends ranges of joints to ranges."""
         return stance.misfit <= 1 and all(
-            matcher.pairing.range_gap(i, j) <= _RANGE
+            (range_gaps(matcher.pairing.gaps, list(matcher.joints().items())) <= _RANGE).all()
             for matcher in stance.matchers
-            for i, j in matcher.joints().items()
         )
 
     def _settled(self, stance: Stance) -> Stance:
@@ -169,27 +173,28 @@ class Search:
         sums = np.zeros(model.nq)
         on_line = np.isin(model.jnt_type, (HINGE, SLIDE))
         for matcher in stance.matchers:
-            for i, j in matcher.joints().items():
-                if on_line[i]:
-                    sign = matcher.pairing.sign(i, j)
-                    start, end = model.jnt_qposadr[[i, j]]
-                    offset = float(qpos[end] - sign * qpos[start])
-                    limit = _SNAP
-                    if int(model.jnt_type[i]) == SLIDE:
-                        limit *= matcher.pairing.parts.size(int(model.jnt_bodyid[i]))
-                    sums[end] += sign * qpos[start] + self._snapped(i, j, sign, offset, limit, by_ranges)
+            pairs = [(i, j) for i, j in matcher.joints().items() if on_line[i]]
+            (i, j), signs = columns(pairs), matcher.pairing.gaps.signs(pairs)
+            moved, ends = signs * qpos[model.jnt_qposadr[i]], model.jnt_qposadr[j]
+            sizes = matcher.pairing.parts.link_sizes[self.skeleton.joint_links[i]]
+            limits = _SNAP * np.where(model.jnt_type[i] == SLIDE, sizes, 1.0)
+            sums[ends] += moved + self._snapped(i, j, signs, qpos[ends] - moved, limits, by_ranges)
         even = qpos.copy()
         address = model.jnt_qposadr[on_line]
         even[address] = sums[address] / len(stance.matchers)
         return even
 
-    def _snapped(self, i: int, j: int, sign: float, offset: float, limit: float, by_ranges: bool) -> float:
-        """An offset, or the one near it that is meant: none, or that between the ranges."""
-        meant = [0.0]
-        if self.model.jnt_limited[i] and self.model.jnt_limited[j]:
-            middles = self.model.jnt_range[[i, j]].mean(axis=1)
-            meant.insert(0 if by_ranges else 1, float(middles[1] - sign * middles[0]))
-        return next((value for value in meant if abs(value - offset) < limit), offset)
+    def _snapped(
+        self, i: Numbers, j: Numbers, signs: Array, offsets: Array, limits: Array, by_ranges: bool
+    ) -> Array:
+        """Offsets, or those near them that are meant: none, or those between the ranges."""
+        limited, middles = self.model.jnt_limited != 0, self.model.jnt_range.mean(axis=1)
+        between = middles[j] - signs * middles[i]
+        none_near = np.abs(offsets) < limits
+        between_near = limited[i] & limited[j] & (np.abs(between - offsets) < limits)
+        first, second = (between_near, none_near) if by_ranges else (none_near, between_near)
+        meant, other = (between, 0.0) if by_ranges else (0.0, between)
+        return np.where(first, meant, np.where(second, other, offsets))
 
     def _refuse(self, tried: list[Stance]) -> NoReturn:
         best = min(tried, key=lambda stance: stance.misfit)
@@ -199,7 +204,7 @@ class Search:
             for name, matcher in zip(names, best.matchers, strict=True)
         ]
         misfit, name, matcher = next(f for f in found if f[0].size > 1)
-        reason = matcher.pairing.explain(misfit, name, tolerance)
+        reason = explain(matcher.pairing, misfit, name, tolerance)
         if misfit.kind == "missing":
             raise SymmetryError(reason)
         words = list(dict.fromkeys(stance.words for stance in tried))

@@ -15,11 +15,13 @@ def map_sites(
 ) -> dict[int, int]:
     """Image of every site that has one: on the image link, where R sends it."""
     images: dict[int, int] = {}
-    owner = weld_ids(model)[model.site_bodyid]
+    on_link: dict[int, list[int]] = {}
+    for site, link in enumerate(weld_ids(model)[model.site_bodyid].tolist()):
+        on_link.setdefault(link, []).append(site)
     for a, b in bodies.items():
-        mine, theirs = np.flatnonzero(owner == a), np.flatnonzero(owner == b)
-        if not len(mine) or not len(theirs):
+        if a not in on_link or b not in on_link:
             continue
+        mine, theirs = np.array(on_link[a]), np.array(on_link[b])
         moved = data.site_xpos[mine] @ matcher.matrix.T
         cost = np.linalg.norm(moved[:, None] - matcher.image.site_xpos[theirs], axis=-1) / matcher.extent
         # sites in one place are told apart by their size and by staying where they are

@@ -28,7 +28,7 @@ def map_tendons(matcher: Matcher, map_: CoordinateMap, tolerance: float) -> dict
         SymmetryError: a tendon couples joints or sites whose images no tendon couples.
     """
     model, count = matcher.model, matcher.model.ntendon
-    if np.array_equal(matcher.matrix, np.eye(3)):
+    if matcher.is_identity:
         return {t: Image(t) for t in range(count)}
     lengths = [tendon_length(model, t)[: model.nv] for t in range(count)]
     signs, cost = np.ones((count, count)), np.full((count, count), _MISFIT)

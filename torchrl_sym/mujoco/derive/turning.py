@@ -43,6 +43,8 @@ class Turning:
         self.generators = generators
         # trees whose first joints have images in some turn: then it is the pose, if others have none
         self.held: set[int] = set()
+        # support functions of trees, by what the directions are turned by: many pairs ask for the same
+        self._hulls: dict[tuple[int, bytes], Array] = {}
 
     def usual(self, tree: int) -> list[tuple[str, Array]]:
         """Turns that are tried first, in words and as matrices: the same for all trees."""
@@ -60,7 +62,7 @@ class Turning:
         frame = self.parts.data.xmat[tree].reshape(3, 3)
         if self.is_object(tree):
             yield "upright", frame.T
-            moments, axes = np.linalg.eigh(self.parts.links[tree].inertia)
+            moments, axes = np.linalg.eigh(self.parts.inertias[tree])
             axes[:, 0] *= np.linalg.det(axes)
             if np.ptp(moments) > 1e-6 * moments.max():
                 for k in range(3):
@@ -122,15 +124,19 @@ class Turning:
         size = self.parts.sizes[b]
         gaps = [float(np.linalg.norm(matrix @ self.parts.centers[a] - self.parts.centers[b])) / size]
         gaps.append(abs(one.mass - other.mass) / max(one.mass, other.mass, 1e-12))
-        inertia = matrix @ one.inertia @ matrix.T - other.inertia
-        gaps.append(float(np.abs(inertia).max()) / max(float(np.trace(other.inertia)), 1e-12))
-        gaps.append(
-            float(np.abs(self._hull(a, DIRECTIONS @ matrix) - self._hull(b, DIRECTIONS)).max()) / size
-        )
+        inertia = matrix @ self.parts.inertias[a] @ matrix.T - self.parts.inertias[b]
+        gaps.append(float(np.abs(inertia).max()) / max(float(np.trace(self.parts.inertias[b])), 1e-12))
+        gaps.append(float(np.abs(self._hull(a, matrix) - self._hull(b, np.eye(3))).max()) / size)
         return max(gaps) / max(self.tolerance, 1e-12)
 
-    def _hull(self, tree: int, directions: Array) -> Array:
-        """Support function, about its point, of what may collide on a tree's first link, else of all."""
+    def _hull(self, tree: int, matrix: Array) -> Array:
+        """Support function of the image of a tree's first link: of what may collide on it, else of all."""
+        key = tree, matrix.tobytes()
+        if key not in self._hulls:
+            self._hulls[key] = self._support(tree, DIRECTIONS @ matrix)
+        return self._hulls[key]
+
+    def _support(self, tree: int, directions: Array) -> Array:
         model = self.model
         geoms = np.flatnonzero((weld_ids(model)[model.geom_bodyid] == tree) & (model.geom_type != PLANE))
         touching = geoms[(model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)]

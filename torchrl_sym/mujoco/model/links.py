@@ -1,27 +1,35 @@
-"""Rigid links of a MuJoCo model at one pose.
+"""Rigid links of a MuJoCo model.
 
 A *link* is a body that moves on its own (it has a joint or is a mocap body) together with everything
 welded to it; the world is a link too. Links rather than bodies are matched, so that it does not matter how
 a modeller split a rigid part into bodies, or where the body frames are.
+
+How links hang together and what they weigh is the same at every pose: a `Skeleton` is read once, and says
+for any pose where the links' masses are and how large its trees are.
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchrl_sym import checks
 from torchrl_sym.mujoco.model.releases import weld_ids
 from torchrl_sym.mujoco.model.types import FREE, Array, MjData, MjModel, name_of
 
 _NO_EXTENT = 1e-6  # metres; the size of what has none
+_NO_MASS = 1e-12  # kg; what is taken for the mass of what has none, to divide by
+
+Numbers = NDArray[np.intp]
 
 
 @dataclass
 class Link:
-    """A rigid part at the reference pose; positions and axes in the world frame."""
+    """A rigid part."""
 
     body: int
     parent: int
@@ -30,67 +38,161 @@ class Link:
     joints: list[int] = field(default_factory=list)
     children: list[int] = field(default_factory=list)
     mass: float = 0.0
-    com: Array = field(default_factory=lambda: np.zeros(3))
-    inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
 
-def links_of(model: MjModel, data: MjData) -> dict[int, Link]:
-    """Links by the number of the body that moves them, the world (0) first."""
-    links: dict[int, Link] = {}
-    for body in range(model.nbody):
-        root = int(weld_ids(model)[body])
-        if root == body:
-            parent = int(weld_ids(model)[model.body_parentid[body]]) if body else -1
-            start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
-            links[body] = Link(body, parent, joints=list(range(start, start + count)))
-            if body:
-                links[parent].children.append(body)
-                links[body].tree = links[parent].tree or body
-        links[root].bodies.append(body)
-    for link in links.values():
-        _lump(model, data, link)
-    return links
+@dataclass(frozen=True)
+class Lumps:
+    """Where the masses of links are at a pose, in the world; by body number, of other bodies zero.
 
-
-def _lump(model: MjModel, data: MjData, link: Link) -> None:
-    """Mass, centre of mass and inertia about it of all bodies of a link; the world's do not matter."""
-    bodies = [link.body] if link.body == 0 else link.bodies
-    masses, centers = model.body_mass[bodies], data.xipos[bodies]
-    link.mass = float(masses.sum())
-    link.com = masses @ centers / link.mass if link.mass > 0 else data.xpos[link.body].copy()
-    axes, arms = data.ximat[bodies].reshape(-1, 3, 3), centers - link.com
-    second = np.einsum("bij,bj,bkj->ik", axes, model.body_inertia[bodies], axes)
-    spread = np.einsum("b,bi,bj->ij", masses, arms, arms)
-    link.inertia = second + np.trace(spread) * np.eye(3) - spread
-
-
-def sizes_of(model: MjModel, data: MjData, links: dict[int, Link]) -> dict[int, float]:
-    """Size of every tree of moving links, by its first link: the longest side of the box around it.
-
-    Lengths are compared relative to it rather than to ``stat.extent``, which a wall 60 m away sets. Trees
-    that are fixed to the world make one machine: its box counts for all, up to twice the largest of them.
+    Attributes:
+        centers: centres of mass, ``(nbody, 3)``; of a link without mass, its origin.
+        inertias: about them, ``(nbody, 3, 3)``.
     """
-    boxes = model.geom_aabb.reshape(-1, 2, 3)
-    turns = data.geom_xmat.reshape(-1, 3, 3)
-    centers = data.geom_xpos + np.einsum("gij,gj->gi", turns, boxes[:, 0])
-    halves = np.einsum("gij,gj->gi", np.abs(turns), boxes[:, 1])
-    bounded = (model.geom_rbound > 0)[:, None]  # planes are not
-    low = np.concatenate([data.xpos, np.where(bounded, centers - halves, np.inf)])
-    high = np.concatenate([data.xpos, np.where(bounded, centers + halves, -np.inf)])
-    root = np.array([links[b].tree for b in weld_ids(model)])
-    owner = np.concatenate([root, root[model.geom_bodyid]])
-    bottom, top = np.full((model.nbody, 3), np.inf), np.full((model.nbody, 3), -np.inf)
-    np.minimum.at(bottom, owner, low)
-    np.maximum.at(top, owner, high)
-    trees = sorted(set(root.tolist()) - {0})
-    sizes = {b: max(float((top[b] - bottom[b]).max()), _NO_EXTENT) for b in trees}
-    fixed = [b for b in trees if not is_loose(model, b)]
-    if fixed:
-        together = float((top[fixed].max(axis=0) - bottom[fixed].min(axis=0)).max())
-        together = min(together, 2 * max(sizes[b] for b in fixed))
-        # parked dummies have no extent of their own
-        sizes |= dict.fromkeys(fixed, together if together > _NO_EXTENT else max(sizes.values()))
-    return sizes
+
+    centers: Array
+    inertias: Array
+
+
+class Skeleton:
+    """How the links of a model hang together.
+
+    Attributes:
+        model: the model; its masses, and which bodies there are, must not change.
+        links: by the number of the body that moves them, the world (0) first.
+        owner: the link of every body, ``(nbody,)``.
+        tree: the tree of every link by body number, 0 of the world and of other bodies, ``(nbody,)``.
+        masses: of links by body number, of other bodies zero, ``(nbody,)``; the world's is its own body's.
+        total_mass: of all that moves.
+        joint_links: the link of every joint, ``(njnt,)``.
+        kinds: types of joints.
+        fixed: trees that hang on the world.
+        loose: trees that nothing holds.
+    """
+
+    def __init__(self, model: MjModel) -> None:
+        self.model, self.owner = model, weld_ids(model).astype(np.intp)
+        self.links: dict[int, Link] = {}
+        for body, root in enumerate(self.owner.tolist()):
+            if root == body:
+                parent = int(self.owner[model.body_parentid[body]]) if body else -1
+                start, count = int(model.body_jntadr[body]), int(model.body_jntnum[body])
+                self.links[body] = Link(body, parent, joints=list(range(start, start + count)))
+                if body:
+                    self.links[parent].children.append(body)
+                    self.links[body].tree = self.links[parent].tree or body
+            self.links[root].bodies.append(body)
+
+        self.tree = np.zeros(model.nbody, dtype=np.intp)
+        self.tree[list(self.links)] = [link.tree for link in self.links.values()]
+
+        counted = np.flatnonzero((self.owner != 0) | (np.arange(model.nbody) == 0))
+        self._lumped = _Groups(counted, self.owner[counted])
+        self.masses = np.zeros(model.nbody)
+        self.masses[self._lumped.labels] = self._lumped.sum(model.body_mass[self._lumped.members])
+        for body, link in self.links.items():
+            link.mass = float(self.masses[body])
+
+        self.total_mass = max(float(self.masses[1:].sum()), _NO_MASS)
+        self.kinds: list[int] = model.jnt_type.tolist()
+        self.joint_links = self.owner[model.jnt_bodyid]
+        trees = self.links[0].children
+        self.fixed = [b for b in trees if not is_loose(model, b)]
+        self.loose = [b for b in trees if is_loose(model, b)]
+
+    @functools.cached_property
+    def names(self) -> dict[str, list[str]]:
+        """Names of bodies and of joints, by kind and number."""
+        counts = {"body": self.model.nbody, "joint": self.model.njnt}
+        return {kind: [name_of(self.model, kind, k) for k in range(n)] for kind, n in counts.items()}
+
+    @functools.cached_property
+    def numbers(self) -> dict[str, dict[str, int]]:
+        """Numbers of bodies and of joints, by kind and name."""
+        return {kind: {name: k for k, name in enumerate(names)} for kind, names in self.names.items()}
+
+    @functools.cached_property
+    def geoms(self) -> dict[int, list[int]]:
+        """Geoms of every link that has some."""
+        found: dict[int, list[int]] = {}
+        for geom, link in enumerate(self.owner[self.model.geom_bodyid].tolist()):
+            found.setdefault(link, []).append(geom)
+        return found
+
+    def lumps(self, data: MjData) -> Lumps:
+        """Where the masses are at a pose."""
+        model, members, labels = self.model, self._lumped.members, self._lumped.labels
+        masses, places = model.body_mass[members], data.xipos[members]
+        total = self.masses[labels][:, None]
+        centers, inertias = np.zeros((model.nbody, 3)), np.zeros((model.nbody, 3, 3))
+        weighted = self._lumped.sum(masses[:, None] * places) / np.where(total > 0, total, 1.0)
+        centers[labels] = np.where(total > 0, weighted, data.xpos[labels])
+
+        axes, arms = data.ximat[members].reshape(-1, 3, 3), places - centers[self.owner[members]]
+        second = (axes * model.body_inertia[members][:, None]) @ axes.swapaxes(1, 2)
+        spread = masses[:, None, None] * arms[:, :, None] * arms[:, None]
+        away = masses * (arms * arms).sum(axis=1)
+        inertias[labels] = self._lumped.sum(second + away[:, None, None] * np.eye(3) - spread)
+        return Lumps(centers, inertias)
+
+    @functools.cached_property
+    def _boxed(self) -> tuple[Numbers, Numbers, _Groups]:
+        """Bodies and bounded geoms that move, and the trees of both: planes have no end."""
+        model = self.model
+        root = self.tree[self.owner]
+        bodies = np.flatnonzero(root)
+        geoms = np.flatnonzero((model.geom_rbound > 0) & (root[model.geom_bodyid] > 0))
+        owners = np.concatenate([root[bodies], root[model.geom_bodyid[geoms]]])
+        return bodies, geoms, _Groups(np.arange(len(owners)), owners)
+
+    def sizes(self, data: MjData) -> dict[int, float]:
+        """Size of every tree of moving links at a pose: the longest side of the box around it.
+
+        Lengths are compared relative to it rather than to ``stat.extent``, which a wall 60 m away sets.
+        Trees that are fixed to the world make one machine: its box counts for all, up to twice the largest
+        of them.
+        """
+        bodies, geoms, trees = self._boxed
+        if not len(trees.labels):
+            return {}
+        boxes, turns = (
+            self.model.geom_aabb[geoms].reshape(-1, 2, 3),
+            data.geom_xmat[geoms].reshape(-1, 3, 3),
+        )
+        centers = data.geom_xpos[geoms] + (turns @ boxes[:, 0, :, None])[..., 0]
+        halves = (np.abs(turns) @ boxes[:, 1, :, None])[..., 0]
+        low = trees.least(np.concatenate([data.xpos[bodies], centers - halves])[trees.members])
+        high = -trees.least(-np.concatenate([data.xpos[bodies], centers + halves])[trees.members])
+        sides = np.maximum((high - low).max(axis=1), _NO_EXTENT)
+        sizes = dict(zip(trees.labels.tolist(), sides.tolist(), strict=True))
+        if self.fixed:
+            some = np.searchsorted(trees.labels, self.fixed)
+            together = float((high[some].max(axis=0) - low[some].min(axis=0)).max())
+            together = min(together, 2 * float(sides[some].max()))
+            # parked dummies have no extent of their own
+            sizes |= dict.fromkeys(self.fixed, together if together > _NO_EXTENT else max(sizes.values()))
+        return sizes
+
+
+class _Groups:
+    """Sums and least values over groups of rows.
+
+    Attributes:
+        members: what the rows are, group by group.
+        labels: of the groups, in ascending order.
+    """
+
+    def __init__(self, members: Numbers, labels: Numbers) -> None:
+        order = np.argsort(labels, kind="stable")
+        self.members = members[order]
+        self.labels, self._starts = np.unique(labels[order], return_index=True)
+
+    def sum(self, rows: Array) -> Array:
+        """Of rows in the order of the members."""
+        return np.add.reduceat(rows, self._starts, axis=0)
+
+    def least(self, rows: Array) -> Array:
+        """Of rows in the order of the members."""
+        return np.minimum.reduceat(rows, self._starts, axis=0)
 
 
 def is_loose(model: MjModel, body: int) -> bool:

@@ -52,13 +52,19 @@ def poses(model: MjModel, keyframe: int | str | None = None) -> list[Pose]:
     return kept
 
 
-def kinematics(model: MjModel, pose: Pose) -> MjData:
-    """Where everything is at a pose."""
-    data = mj.MjData(model)
-    data.qpos[:], data.mocap_pos[:], data.mocap_quat[:] = pose.qpos, pose.mocap_pos, pose.mocap_quat
-    mj.mj_kinematics(model, data)
-    mj.mj_comPos(model, data)
-    return data
+def kinematics(model: MjModel, pose: Pose, data: MjData | None = None) -> MjData:
+    """Where everything is at a pose.
+
+    Args:
+        model: the model.
+        pose: the pose.
+        data: to be overwritten; a new one by default, which takes longer to make than to fill.
+    """
+    filled: MjData = mj.MjData(model) if data is None else data
+    filled.qpos[:], filled.mocap_pos[:], filled.mocap_quat[:] = pose.qpos, pose.mocap_pos, pose.mocap_quat
+    mj.mj_kinematics(model, filled)
+    mj.mj_comPos(model, filled)
+    return filled
 
 
 def reference_pose(model: MjModel, keyframe: int | str | None) -> MjData:

@@ -46,11 +46,18 @@ def label_of(model: MjModel, kind: str, index: int) -> str:
 
 @functools.cache
 def _numbers() -> list[str]:
-    """Names of a model's arrays of real numbers."""
+    """Names of a model's arrays of real numbers.
+
+    Without the boxes around faces of meshes, of which robots have millions: they follow from the vertices.
+    """
     model = mj.MjSpec().compile()
     fields = (name for name in dir(model) if not name.startswith("_"))
     values = {name: getattr(model, name) for name in fields}
-    return [n for n, x in values.items() if isinstance(x, np.ndarray) and x.dtype.kind == "f"]
+    return [
+        n
+        for n, x in values.items()
+        if isinstance(x, np.ndarray) and x.dtype.kind == "f" and n != "bvh_aabb"
+    ]
 
 
 def check_model(model: MjModel) -> MjModel:

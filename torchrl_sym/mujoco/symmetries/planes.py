@@ -12,7 +12,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from torchrl_sym.mujoco.model.links import Link, links_of
+from torchrl_sym.mujoco.model.links import Skeleton
 from torchrl_sym.mujoco.model.types import HINGE, SLIDE, Array, MjData, MjModel
 
 _STEP = 0.05  # degrees; planes nearer than this are one
@@ -37,7 +37,7 @@ def candidate_planes(model: MjModel, data: MjData) -> list[float]:
         [0, 90, 135]
     """
     found: dict[int, list[tuple[float, float]]] = {}  # angles and their weights, by place on a grid
-    for direction, weight in _proposals(model, data, links_of(model, data)):
+    for direction, weight in _proposals(model, data):
         if np.linalg.norm(direction[:2]) > 1e-6:
             angle = float(np.degrees(np.arctan2(direction[1], direction[0]))) % 180
             found.setdefault(round(angle / _STEP) % round(180 / _STEP), []).append((angle, weight))
@@ -47,16 +47,19 @@ def candidate_planes(model: MjModel, data: MjData) -> list[float]:
     return [*usual.values(), *(max(found[key], key=lambda pair: pair[1])[0] for key in ranked)]
 
 
-def _proposals(model: MjModel, data: MjData, links: dict[int, Link]) -> Iterator[tuple[Array, float]]:
+def _proposals(model: MjModel, data: MjData) -> Iterator[tuple[Array, float]]:
     """Normals of planes, with weights."""
+    skeleton = Skeleton(model)
+    links, centers = skeleton.links, skeleton.lumps(data).centers
     vertical = np.array([0.0, 0.0, 1.0])
     for link in links.values():
         children = [links[c] for c in link.children]
         for i, one in enumerate(children):
-            yield np.cross(vertical, one.com - data.xpos[link.body]), 0.5  # it is carried to itself
+            apart = centers[one.body] - data.xpos[link.body]
+            yield np.cross(vertical, apart), 0.5  # it is carried to itself
             for other in children[:i]:
                 if abs(one.mass - other.mass) <= _ALIKE * max(one.mass, other.mass):
-                    yield one.com - other.com, 1.0
+                    yield centers[one.body] - centers[other.body], 1.0
         for j in link.joints:
             if int(model.jnt_type[j]) in (HINGE, SLIDE):
                 yield data.xaxis[j], 0.1

@@ -56,6 +56,7 @@ class Averager:
             )
         matcher = self.actions[0].matcher
         self.data, self.links = matcher.data, matcher.links
+        self.lumps = matcher.skeleton.lumps(self.data)
         self.bodies: Maps = [
             {a: b for a, b in action.coordinates.bodies.items() if a not in self.carried}
             for action in self.actions

@@ -15,9 +15,9 @@ def average_inertials(averager: Averager) -> None:
     """Of every link; the inertia of several welded bodies goes to the one that moves."""
     model, turns, links = averager.model, averager.turns, averager.links
     masses = averager.mean(averager.bodies, lambda _, a: links[a].mass)
-    coms = np.array([links[b].com if b in links else np.zeros(3) for b in range(model.nbody)])
-    centers = averager.points(averager.bodies, coms, int)
-    inertias = averager.mean(averager.bodies, lambda g, a: turns[g] @ links[a].inertia @ turns[g].T)
+    lumps = averager.lumps
+    centers = averager.points(averager.bodies, lumps.centers, int)
+    inertias = averager.mean(averager.bodies, lambda g, a: turns[g] @ lumps.inertias[a] @ turns[g].T)
     for b in range(1, model.nbody):  # what the compiler found, as it shall not look at the geoms again
         found = (getattr(model, f"body_{name}")[b] for name in ("mass", "ipos", "iquat", "inertia"))
         _set_inertial(averager.spec.bodies[b], *found)
@@ -32,12 +32,12 @@ def average_inertials(averager: Averager) -> None:
         if not masses[b] > 0:
             continue
         # the centre may have stayed in the world while the frame moved, which is no change of the robot
-        new, size = averager.in_body(b, centers[b]), float(np.trace(link.inertia)) or 1.0
-        old = turn.T @ (link.com - averager.data.xpos[b])
+        new, size = averager.in_body(b, centers[b]), float(np.trace(lumps.inertias[b])) or 1.0
+        old = turn.T @ (lumps.centers[b] - averager.data.xpos[b])
         changed = [
             averager.write(None, "", masses[b], link.mass, "mass", name),
             averager.write(None, "", new, old, "centre of mass", name, averager.extent),
-            averager.write(None, "", inertias[b], link.inertia, "inertia", name, size),
+            averager.write(None, "", inertias[b], lumps.inertias[b], "inertia", name, size),
         ]
         if any(changed):
             moments, axes = np.linalg.eigh(turn.T @ inertias[b] @ turn)
