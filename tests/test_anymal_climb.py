@@ -20,6 +20,7 @@ from tasks.anymal_climb import (
     TASK_WEIGHTS,
     AnymalClimb,
 )
+from tasks.constants import Constant
 from tasks.environment import BatchedEnv
 from tests.task_helpers import make, reached, starting_at
 from torchrl_sym.mujoco import verify
@@ -68,7 +69,7 @@ def test_heights_are_those_that_rays_from_above_hit():
         data.qpos[2] = 50.0  # out of the way
         mujoco.mj_kinematics(task.model, data)
         box = state.mocap_pos[row, 0]
-        for point, (x, y) in enumerate(zip(task._grid_x.double(), task._grid_y.double(), strict=True)):
+        for point, (x, y) in enumerate(task._grid.values.T):
             origin = state.qpos[row, 0:3] + turned[row] @ torch.stack([x, y, torch.zeros_like(x)])
             edge = float(((origin[:2] - box[:2]).abs().max() - BOX).abs())
             if edge < 1e-4:  # rounding decides
@@ -215,7 +216,7 @@ class ShiftedMap(AnymalClimb):
 
     def __init__(self, **kwargs):
         super().__init__(**kwargs)
-        self._grid_x = self._grid_x + 0.1
+        self._grid = Constant(self._grid.values + torch.tensor([[0.1], [0.0]]))
 
 
 class BoxAhead(AnymalClimb):

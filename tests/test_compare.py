@@ -334,14 +334,15 @@ def test_the_search_prefers_high_returns_and_complete_candidates(tmp_path):
 
 
 def test_the_methods_use_what_the_search_found():
-    stored = ROOT / "benchmarks" / "results" / "tuning"
-    found = study.read(stored)
-    assert (stored / "README.md").read_text() == tune.table(found)
     winners = {}
-    for column, family in enumerate(tune.FAMILIES, start=2):
-        rows = [line.split("|") for line in (stored / "README.md").read_text().splitlines() if "**" in line]
-        (winner,) = [row[1].strip() for row in rows if "**" in row[column]]
-        winners[Method.parse(family).family] = tune.CANDIDATES[winner]
+    for name, families in {"tuning": tune.FAMILIES, "tuning-networks": ("equivariant", "relaxed")}.items():
+        stored = ROOT / "benchmarks" / "results" / name
+        text = (stored / "README.md").read_text()
+        assert text == tune.table(study.read(stored))
+        rows = [line.split("|") for line in text.splitlines() if "**" in line]
+        for column, family in enumerate(families, start=2):
+            (winner,) = [row[1].strip() for row in rows if "**" in row[column]]
+            winners[Method.parse(family).family] = tune.CANDIDATES[winner]
     assert SETTINGS["cartpole"].tuned == winners
 
 
