@@ -16,8 +16,6 @@ from comparison import pool
 from comparison.run import Run, read_curve
 from tasks.settings import SETTINGS
 
-pytest.importorskip("ray", reason="Ray is an extra: pip install 'torchrl_sym[ray]'")
-
 
 @pytest.fixture(scope="module")
 def cluster():

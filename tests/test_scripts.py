@@ -65,7 +65,6 @@ def test_symmetric_ppo():
 
 @pytest.mark.slow
 def test_ray_collectors():
-    pytest.importorskip("ray", reason="Ray is an extra: pip install 'torchrl_sym[ray]'")
     assert "iteration 1" in run("examples/ray_collectors.py", "2", "1")
 
 
