@@ -40,21 +40,26 @@ def doses(on: Doses) -> Figure:
     return figure
 
 
-def cost(tasks: Mapping[str, TaskResults]) -> Figure:
-    """Variation between equivalent goals over the time of a training step, a panel per task."""
+def cost(tasks: Mapping[str, TaskResults], costs: Mapping[str, Mapping[str, float]]) -> Figure:
+    """Variation between equivalent goals over what training costs, a panel per task.
+
+    Args:
+        tasks: results by title.
+        costs: of a step, by the task's name and method (`study_costs.py`).
+    """
     figure, axes = grid(1, len(tasks), 5.0, 3.6)
     for axis, (title, task) in zip(axes[0], tasks.items(), strict=True):
         axis.set_yscale("log")
-        plain = task["ppo"].seconds_per_step
+        of = costs[task.name]
         for results in task.values():
             values = np.maximum(results.variation(), LEAST_VARIATION)
             found = estimate(np.log10(values))
-            x, y = results.seconds_per_step / plain, 10**found.value
+            x, y = of[results.name] / of["ppo"], 10**found.value
             reach = [[y - 10**found.low], [10**found.high - y]] if np.isfinite(found.low) else None
-            axis.errorbar(x, y, reach, fmt="o", color=color(results.method), markersize=5, linewidth=1)
-            axis.annotate(results.label, (x, y), (5, 4), textcoords="offset points", fontsize=7.5)
-        axis.margins(x=0.25)
-        axis.set(title=title, xlabel="time of a step, of plain PPO's", ylabel="variation of the return")
+            style = {"color": color(results.method), "label": results.label}
+            axis.errorbar(x, y, reach, fmt="o", markersize=5, linewidth=1, **style)
+        axis.set(title=title, xlabel="processor time of a step, of PPO's", ylabel="variation of the return")
+        axis.legend(frameon=False, fontsize=7.5, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
 
 

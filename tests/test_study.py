@@ -1,6 +1,9 @@
 """The study of networks and of asymmetry: tasks with arguments of their own, rules, page."""
 
+import dataclasses
+import json
 import math
+import re
 
 import numpy as np
 import pandas as pd
@@ -11,6 +14,7 @@ from torchrl.envs.utils import ExplorationType
 import compare
 import neutral
 import plot_study
+import study_costs
 import study_page
 from comparison import doses, network_claims
 from comparison.doses import Dose, Doses, Rule
@@ -131,11 +135,12 @@ def test_a_dose_that_one_side_lacks_is_left_out():
 def test_the_page_has_everything_that_there_is(tmp_path):
     symmetric, under = dosed((-1.0, -1.1, -1.2), (-1.0, -1.1, -2.0), (-1.5,) * 3)
     studies = {"study-cartpole": symmetric, "study-cartpole-doses": under}
-    text = study_page.page(studies, tmp_path)
+    costs = {"cartpole": dict.fromkeys(symmetric["cartpole"], 15.0) | {"ppo": 12.0}}
+    text = study_page.page(studies, costs, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"cost.png", "cartpole.png"}
     assert "## CartPole: which way" in text and "## CartPole: a dose" in text and "| knob 2 |" in text
-    assert text == study_page.page(studies)
-    alone = study_page.page({"study-cartpole": symmetric})
+    assert text == study_page.page(studies, costs) and "| 15.0 |" in text and "| 1.25 |" in text
+    alone = study_page.page({"study-cartpole": symmetric}, costs)
     assert "## CartPole: which way" in alone and "a dose of asymmetry" not in alone
     assert len(plot_study.doses(Doses(symmetric["cartpole"], under)).axes) == 2
 
@@ -209,6 +214,15 @@ def test_who_leaves_neutral_starts():
     assert neutral.table(rows).splitlines()[2].startswith("| a | sampled | 0% | 0% |")
 
 
+def test_what_a_step_costs_is_measured_for_every_method(tmp_path, monkeypatch):
+    tiny = dataclasses.replace(SETTINGS["cartpole"].replace(num_envs=8, horizon=4), tuned={})
+    monkeypatch.setattr(study_costs, "task_setting", lambda task: tiny)
+    arguments = study_costs.Arguments(("study-cartpole",), 1, tmp_path / "costs.json")
+    assert study_costs.main(arguments) == 0
+    costs = json.loads(arguments.output.read_text())["costs"]["cartpole"]
+    assert {"ppo", "aug", "equivariant", "relaxed"} < set(costs) and min(costs.values()) > 0
+
+
 def test_evaluations_under_other_arguments_come_on_top():
     setting = compare.evaluated_under(["wind=1", "motor_bias=0.5"], "cartpole")
     assert setting.evaluations == {"task": {}, "wind=1": {"wind": 1}, "motor_bias=0.5": {"motor_bias": 0.5}}
@@ -219,3 +233,11 @@ def test_evaluations_under_other_arguments_come_on_top():
         compare.chosen(compare.Arguments(under=("wind=1", "wind=1")))
     with pytest.raises(ValueError, match="rail_tilt"):
         compare.evaluated_under(["tilt=1"], "cartpole")
+
+
+def test_the_page_follows_from_the_stored_results():
+    stored = study_page.stored(study_page.HERE / "results")
+    page = (study_page.HERE.parent / "docs" / "study.md").read_text()
+    assert page == study_page.page(*stored), "run python benchmarks/study_page.py"
+    drawn = set(re.findall(r"\]\(\.\./benchmarks/plots/study/(.*?)\)", page))
+    assert drawn == {path.name for path in (study_page.HERE / "plots" / "study").iterdir()}
