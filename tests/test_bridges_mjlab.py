@@ -15,8 +15,10 @@ from pathlib import Path
 import mujoco
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import MJLabWrapper
 
+from tests.foreign import assert_loss_takes_copies
 from torchrl_sym import PointGroup, Symmetry
 from torchrl_sym.bridges import mjlab
 from torchrl_sym.bridges.rsl_rl import data_augmentation
@@ -152,6 +154,22 @@ def test_torchrl_and_rsl_rl_take_it(humanoid):
     assert mjlab.symmetry(wrapped, MIRROR).keys() == symmetry.keys()
 
 
+def test_mirrored_robots_observe_images_through_torchrls_wrapper(humanoid):
+    symmetry, wrapped = mjlab.symmetry(humanoid, MIRROR), MJLabWrapper(humanoid)
+    mirrored_steps(humanoid, symmetry)
+    action = symmetry["action"].orbit(0.5 * torch.randn(29))
+    seen = wrapped.step(TensorDict(action=action, batch_size=[2]))["next"]
+    for key in ("actor", "frames", ("parts", "joint_pos")):
+        here, there = seen[key]
+        assert (symmetry[key](here, "reflect-y") - there).abs().max() < CLOSE, key
+        assert (here - there).abs().max() > 3 * CLOSE, key
+
+
+def test_a_loss_takes_what_torchrls_wrapper_gives(humanoid):
+    keys = {"actor_keys": ("actor",), "critic_keys": ("critic", "frames", ("parts", "joint_pos"))}
+    assert_loss_takes_copies(MJLabWrapper(humanoid), mjlab.symmetry(humanoid, MIRROR), **keys)
+
+
 def settings(env, group: str, name: str):
     return env.observation_manager.get_term_cfg(group, name)
 
@@ -272,11 +290,22 @@ def test_a_sensor_beside_the_plane_is_named():
     env.close()
 
 
-def test_the_example_trains_and_keeps_the_symmetry(tmp_path):
-    tiny = ["--iterations", "1", "--num-envs", "4", "--device", "cpu", "--out", str(tmp_path / "g1.json")]
+def run(script: str, *arguments: str) -> str:
+    """What a script prints that trains with four robots."""
     environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(ROOT / "examples/mjlab_ppo.py"), *tiny]
+    command = [sys.executable, str(ROOT / script), "--num-envs", "4", "--device", "cpu", *arguments]
     result = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr[-3000:]
-    assert re.search(r"after 1 iterations: mirror error [\d.]+ of the mean action", result.stdout)
+    return result.stdout
+
+
+def test_the_example_trains_and_keeps_the_symmetry(tmp_path):
+    output = run("examples/mjlab_ppo.py", "--iterations", "1", "--out", str(tmp_path / "g1.json"))
+    assert re.search(r"after 1 iterations: mirror error [\d.]+ of the mean action", output)
     assert Symmetry.load(tmp_path / "g1.json")["action"].dim == 29
+
+
+def test_the_example_trains_with_torchrl(tmp_path):
+    output = run("examples/mjlab_torchrl.py", "--iterations", "2", "--folder", str(tmp_path))
+    assert re.search(r"iteration 2: return \S+, KL [\d.]+, mirror loss [\d.]+", output)
+    assert (tmp_path / "checkpoint.pt").exists()
