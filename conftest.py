@@ -18,7 +18,7 @@ if sys.platform == "linux" and ctypes.util.find_library("EGL"):
 
 # The second engine belongs to the extra "gpu". Its kernels run for moments here, and compile for long.
 if importlib.util.find_spec("mujoco_warp") is None:
-    collect_ignore = ["tasks/warp_fields.py", "tasks/warp_simulation.py"]
+    collect_ignore = ["tasks/warp_fields.py", "tasks/warp_simulation.py", "tests/warp_models.py"]
 with contextlib.suppress(ImportError):
     warp = importlib.import_module("warp")
     warp.config.optimization_level, warp.config.enable_backward = 0, False
