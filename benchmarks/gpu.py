@@ -15,7 +15,6 @@ import dataclasses
 import json
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
@@ -42,6 +41,7 @@ from tasks.warp_simulation import WarpSimulation
 from torchrl_sym.recipes import PPOConfig, train
 from torchrl_sym.recipes.learner import Learner
 from torchrl_sym.recipes.networks import make_networks
+from torchrl_sym.recipes.recording import host_waits
 
 HERE = Path(__file__).parent
 HIDDEN = (256, 128, 64)  # of the optimiser step that is compared
@@ -58,6 +58,8 @@ class Arguments:
     """Where numbers, curves and the table go."""
     only: tuple[str, ...] = ()
     """Names of parts: parity, waits, rates, updates, trainings."""
+    tasks: tuple[str, ...] = ()
+    """Whose physics is compared and timed; all on a card, CartPole elsewhere."""
     seconds: float = 75.0
     """Of each training."""
 
@@ -76,8 +78,8 @@ class Scale:
     @classmethod
     def of(cls, arguments: Arguments) -> Scale:
         if torch.device(arguments.device).type == "cuda":
-            return cls(seconds=arguments.seconds)
-        return cls(("cartpole",), (4,), 4, 3, 1, min(arguments.seconds, 2.0))
+            return cls(arguments.tasks or tasks.ALL_TASKS, seconds=arguments.seconds)
+        return cls(arguments.tasks or ("cartpole",), (4,), 4, 3, 1, min(arguments.seconds, 2.0))
 
 
 @dataclass
@@ -276,14 +278,7 @@ def _learner(bench: Bench, method: str, **options: Any) -> tuple[Learner, Tensor
 def _count(work: Callable[[], object]) -> int:
     """How often the host waits in a piece of work."""
     torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("warn")
-    try:
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            work()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    return sum("synchroniz" in str(each.message) for each in found)
+    return len(host_waits(work)[1])
 
 
 PARTS = {"parity": parity, "waits": waits, "rates": rates, "updates": updates, "trainings": trainings}

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from comparison.doses import Dose, Doses
 from comparison.intervals import estimate
 from comparison.study import TaskResults
-from plot import color, grid, legend, style_of
+from plot import color, grid, legend, share_limits, style_of
 
 WAYS = {True: "trained and evaluated under it", False: "trained without, evaluated under it"}
 UNITS = {"motor_bias": "motor bias [m/s]", "rail_tilt": "tilt of the rail [°]", "wind": "wind [m/s]"}
@@ -33,9 +33,7 @@ def doses(on: Doses) -> Figure:
                 axis.fill_between(sizes, [e.low for e in found], [e.high for e in found], **shade)
             axis.set(title=title, xlabel=UNITS.get(knob, knob.replace("_", " ")), ylabel="return")
     for column in axes.T:
-        limits = [axis.get_ylim() for axis in column]
-        for axis in column:
-            axis.set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
+        share_limits(column)
     legend(axes[0, 0])
     return figure
 

@@ -316,3 +316,11 @@ def function(right: Callable[..., Any]) -> Argument:
 def optional(argument: Argument) -> Argument:
     """The same where None stands for a default."""
     return argument.but("None")
+
+
+def of_three(*shape: int) -> dict[str, torch.Tensor]:
+    """Tensors of more rows, and of more dimensions, than the others have."""
+    return {"of three rows": torch.zeros(shape), "one more dimension": torch.zeros(2, *shape)}
+
+
+generator = optional(thing(torch.Generator(), **{"a NumPy generator": np.random.default_rng(0)}))

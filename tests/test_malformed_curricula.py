@@ -14,7 +14,9 @@ from tests.malformed import (
     each,
     flag,
     function,
+    generator,
     number,
+    of_three,
     optional,
     subject,
     tensor,
@@ -23,12 +25,6 @@ from tests.malformed import (
 from torchrl_sym import representations as r
 
 CLIMB, PUSH, CARTPOLE, REPOSE = (base.create(name) for name in tasks.ALL_TASKS)
-generator = optional(thing(torch.Generator(), **{"a NumPy generator": np.random.default_rng(0)}))
-
-
-def of_three(*shape: int) -> dict[str, torch.Tensor]:
-    """Tensors of more rows, and of more dimensions, than the others have."""
-    return {"of three rows": torch.zeros(shape), "one more dimension": torch.zeros(2, *shape)}
 
 
 SUBJECTS = [

@@ -17,7 +17,9 @@ from tests.malformed import (
     element,
     flag,
     function,
+    generator,
     number,
+    of_three,
     optional,
     subject,
     tensor,
@@ -51,11 +53,6 @@ def span(right: tuple[float, float], **more: object) -> Argument:
     return Argument(right, wrong | more)
 
 
-def of_three(*shape: int) -> dict[str, torch.Tensor]:
-    """Tensors of more rows, and of more dimensions, than the others have."""
-    return {"of three rows": torch.zeros(shape), "one more dimension": torch.zeros(2, *shape)}
-
-
 state_ = thing(
     START,
     **{
@@ -66,7 +63,6 @@ state_ = thing(
 )
 task = thing(CARTPOLE, **{"a name": "cartpole", "an environment": ENV})
 n = count(2, low=0)
-generator = optional(thing(torch.Generator(), **{"a NumPy generator": np.random.default_rng(0)}))
 seconds = optional(number(2.0, low=0.02)).but(zero=0.0)
 legged = {"episode_seconds": seconds, "physics_timestep": number(0.01, zero=0.0, odd=0.003),
           "friction": span((0.5, 1.2), negative=(-1.0, 1.0))}  # fmt: skip

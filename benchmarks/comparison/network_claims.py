@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from comparison.claims import decades, margins, steps
+from comparison.claims import better_and_faster, decades, margins, steps
 from comparison.judging import Claims, Evaluated
 from comparison.verdicts import joined, more, no_gain, pair, verdict
 
@@ -60,17 +60,13 @@ def _exact(on: Evaluated) -> tuple[str, str]:
 @claim("One can do without the copies: augmentation is no better than an equivariant network.",
        "MS-PPO", "aug", "equivariant")  # fmt: skip
 def _no_copies(on: Evaluated) -> tuple[str, str]:
-    text, gain = pair(on.returns(), on["aug"], on["equivariant"])
-    margin, _ = margins(on)
-    return f"{text}; margin {margin:.3g}", no_gain(gain, margin)
+    return _no_better(on, "aug", "equivariant")
 
 
 @claim("A free part that is kept small costs nothing where the task is symmetric.", "Finzi et al. 2021",
        "equivariant", "relaxed")  # fmt: skip
 def _free_part(on: Evaluated) -> tuple[str, str]:
-    text, loss = pair(on.returns(), on["equivariant"], on["relaxed"])
-    margin, _ = margins(on)
-    return f"{text}; margin {margin:.3g}", no_gain(loss, margin)
+    return _no_better(on, "equivariant", "relaxed")
 
 
 @claim("Large initial weights hinder augmentation because they are asymmetric.", "asked in Sec. III-B",
@@ -91,10 +87,7 @@ def _asymmetric_weights(on: Evaluated) -> tuple[str, str]:
 @claim("A symmetric start helps augmentation with weights of ordinary size, too.", "not in the papers",
        "aug", "aug+symmetric-init")  # fmt: skip
 def _symmetric_start(on: Evaluated) -> tuple[str, str]:
-    text, gap = pair(on.returns(), on["aug+symmetric-init"], on["aug"])
-    faster, saved = pair(steps, on["aug"], on["aug+symmetric-init"], 2)
-    outcomes = {"higher return": verdict(gap), "speed": verdict(saved)}
-    return f"return: {text}; million steps: {faster}", joined(outcomes)
+    return better_and_faster(on, "aug+symmetric-init")
 
 
 @claim("Equivariant networks fail to learn more often.", "asked here", "aug", "equivariant", figure=None)
@@ -103,6 +96,13 @@ def _fail(on: Evaluated) -> tuple[str, str]:
     counts = [(of - reached, of) for reached, of in (results.reached for results in both)]
     each = ", ".join(f"{m.label} {k} of {n}" for m, (k, n) in zip(both, counts, strict=True))
     return f"seeds that never reach {on.task.threshold:.2f}: {each}", more(*counts)
+
+
+def _no_better(on: Evaluated, a: str, b: str) -> tuple[str, str]:
+    """Whether the return of one method is above that of another by less than a margin."""
+    text, gain = pair(on.returns(), on[a], on[b])
+    margin, _ = margins(on)
+    return f"{text}; margin {margin:.3g}", no_gain(gain, margin)
 
 
 def _share(on: Evaluated, name: str) -> np.ndarray:

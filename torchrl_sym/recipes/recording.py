@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from typing import TypeVar
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
+
+T = TypeVar("T")
 
 _WARMUP = 4  # calls until compilers, the optimizer's state and lazily placed tables are settled
 _SYNC = "called a synchronizing"  # how torch's warning of an operation that waits begins
@@ -61,17 +64,7 @@ class Recorded:
 
     def _watch(self, batch: TensorDictBase) -> Tensor:
         """Call it, and find out whether it waits for the host."""
-        with warnings.catch_warnings(record=True) as found:
-            warnings.simplefilter("always")
-            torch.cuda.set_sync_debug_mode("warn")
-            try:
-                out = self._function(batch)
-            finally:
-                torch.cuda.set_sync_debug_mode("default")
-        waits = [str(each.message) for each in found if _SYNC in str(each.message)]
-        for each in found:
-            if _SYNC not in str(each.message) and "debug mode" not in str(each.message):
-                warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+        out, waits = host_waits(lambda: self._function(batch))
         if waits:
             self._waits = True
             warnings.warn(
@@ -95,3 +88,18 @@ class Recorded:
                 "compile=False, it goes on from the last checkpoint"
             ) from error
         return graph
+
+
+def host_waits(work: Callable[[], T]) -> tuple[T, list[str]]:
+    """What some work on CUDA returns, and in torch's words the operations for which the host waits."""
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            out = work()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    for each in found:
+        if _SYNC not in str(each.message) and "debug mode" not in str(each.message):
+            warnings.warn_explicit(each.message, each.category, each.filename, each.lineno)
+    return out, [str(each.message) for each in found if _SYNC in str(each.message)]
